@@ -127,7 +127,7 @@ lint: venv ## check the style with ruff and the types with mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-generate: venv ## write config/*.yaml and docs/parameters/*.md anew from the code
+generate: venv ## write config/, docs/parameters/ and docs/results/*.md anew from code and results
 	$(BIN)/python docs/generate.py
 
 docs: generate $(DOCS_STAMP) ## the same, and build the pages of docs/ with the reference into site/

@@ -17,6 +17,10 @@ overlap of the patch with the bins called rough, or, without a patch, the share 
 rough. `worst`: the smallest share within two standard deviations of a single ping. `microseconds`:
 CPU time of a bin, all methods in turn on each ping. `calibration`: of `terrain`, the bins of all
 floors by their probability of rough floor, the mean of it and the share that is rough.
+
+`arrays`: `terrain` on the floor `white .5`, with errors of the array in its samples, as they are
+and measured from the echoes, mean over arrays with the fault at other staves; `used`: share of the
+bins with a height, `named`: share of the arrays whose warnings name the fault.
 """
 
 from __future__ import annotations
@@ -26,13 +30,14 @@ import math
 import time
 from typing import Any
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from benchmarks.bathymetry_paper import EXACT_ARRAY
-from benchmarks.study import Parts, Row, study
+from benchmarks.study import Parts, rms, Row, study
 from sonar_imm.acoustics import array
+from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.ping import Ping, track_ping
@@ -139,6 +144,63 @@ def heard(floor: FloorKind, seed: int) -> tuple[Snapshot, TrueProfile]:
     return hear(config, truth, rng), truth
 
 
+FAULTS = (
+    'none',
+    'one stave dead',
+    'one stave weaker by 6 dB',
+    'one stave weaker by 9 dB, its noise as the others',
+    'one stave of noise',
+    'one stave of noise, 25 dB louder',
+    'one stave with 6 dB more noise',
+    'one stave with 10 dB more noise',
+    'one stave inverted',
+    'gains of 3 dB',
+    'gains of 3 dB before a common noise',
+    'phases of 20 deg',
+    'two neighbours exchanged',
+    'two others exchanged',
+    'conjugated',
+)
+
+
+def spoiled(fault: str, snapshot: Snapshot, seed: int) -> Snapshot:
+    """A ping of noise variance 1 whose array has a fault, at another stave for each seed."""
+    rng = np.random.default_rng(seed)
+    y = np.array(snapshot.iq, np.complex128)
+    bins, staves = y.shape
+    one, other = rng.permutation(staves)[:2]
+    beside = one + 1 if one < staves - 1 else one - 1
+    noise = math.sqrt(0.5) * rng.normal(size=(bins, staves, 2)).view(np.complex128)[..., 0]
+    gains = 10.0 ** (0.15 * rng.normal(size=staves))
+    if fault == 'one stave dead':
+        y[:, one] = 0.0
+    elif fault == 'one stave weaker by 6 dB':
+        y[:, one] *= 10.0**-0.3
+    elif fault == 'one stave weaker by 9 dB, its noise as the others':
+        y[:, one] = 10.0**-0.45 * y[:, one] + math.sqrt(1.0 - 10.0**-0.9) * noise[:, one]
+    elif fault == 'one stave of noise':
+        y[:, one] = noise[:, one]
+    elif fault == 'one stave of noise, 25 dB louder':
+        y[:, one] = 10.0**1.25 * noise[:, one]
+    elif fault.endswith('more noise'):
+        y[:, one] += math.sqrt(10.0 ** (0.6 if '6 dB' in fault else 1.0) - 1.0) * noise[:, one]
+    elif fault == 'one stave inverted':
+        y[:, one] *= -1.0
+    elif fault == 'gains of 3 dB':
+        y *= gains
+    elif fault == 'gains of 3 dB before a common noise':
+        gains /= gains.max()
+        y = gains * y + np.sqrt(1.0 - np.square(gains)) * noise
+    elif fault == 'phases of 20 deg':
+        y *= np.exp(1j * math.radians(20.0) * rng.normal(size=staves))
+    elif fault.endswith('exchanged'):
+        pair = [one, beside if fault.startswith('two neighbours') else other]
+        y[:, pair] = y[:, pair[::-1]]
+    elif fault == 'conjugated':
+        y = y.conj()
+    return evolve(snapshot, iq=y.astype(np.complex64))
+
+
 class Scores:
     """Sums over the pings of one floor by one method."""
 
@@ -151,6 +213,9 @@ class Scores:
         estimate = track_ping(Ping(config, snapshot, None)).estimate
         self.seconds += time.process_time() - begin
         self.bins += len(snapshot)
+        self.score(estimate, truth)
+
+    def score(self, estimate: Estimate, truth: TrueProfile) -> None:
         table = estimate.columns()
         used = (table['valid'] > 0) & truth.valid
         rough = table['rough'] if 'rough' in table else table['prob_rw_rough']
@@ -195,8 +260,43 @@ def calibration(found: Sequence[Scores]) -> dict[str, dict[str, float]]:
     return table
 
 
-def main(pings: int = 10, seed: int = 1, banks: bool = False) -> Parts:
+def of_array(fault: str, pings: int, seed: int, **values: Any) -> dict[str, float]:
+    """The heights that a tracker of one array with a fault gives."""
+    scores = Scores()
+    tracker = BathymetryTracker(BathymetryConfig(**EXACT_ARRAY, **values))
+    for ping in range(pings):
+        clean, truth = heard(FLOORS['white .5'], 100_000 * seed + 50_000 + ping)
+        for estimate in tracker.process(spoiled(fault, clean, seed)):
+            scores.score(estimate, truth)
+    error, inside, patch = (scores.whole(name) for name in ('error', 'inside', 'patch'))
+    found = {'used': len(error) / (pings * len(truth.range))}
+    for name, where in (('smooth', ~patch), ('patch', patch)):
+        if where.any():
+            found[f'rmse_{name}'] = rms(error[where])
+            found[f'inside_{name}'] = float(inside[where].mean())
+    starts = 'stave ', 'staves ', 'echoes fit the other sign'
+    named = any(said.startswith(starts) for said in tracker.warnings())
+    return found | {'named': float(named)}
+
+
+def arrays(pings: int, seed: int, others: int) -> Parts:
+    """All faults, at the staves of so many seeds."""
+    for fault in FAULTS:
+        for name, does in (('as it is', False), ('measured', True)):
+            rows = [
+                of_array(fault, pings, seed + k, calibrate_array=does, conjugate_auto=does)
+                for k in range(others)
+            ]
+            row = {
+                each: float(np.mean([row[each] for row in rows if each in row]))
+                for each in max(rows, key=len)
+            }
+            yield {'arrays': {f'{fault}, {name}': row}}
+
+
+def main(pings: int = 10, seed: int = 1, banks: bool = False, array_seeds: int = 5) -> Parts:
     yield {'pings': pings, 'seed': seed}
+    yield from arrays(max(pings // 2, 5), 1000 + seed, array_seeds)
     methods = {
         name: BathymetryConfig(**EXACT_ARRAY, **values)
         for name, values in (METHODS | (BANKS if banks else {})).items()

@@ -16,8 +16,7 @@ lies .5 m or more beside the strongest, at most 15 dB below it and at 0 dB or mo
 has one if no other answers. `soundings`: share of the bins with two that become soundings, of
 these `near`: inside two standard deviations of a surface, and `rmse` to the nearest; with layover
 ignored where it says so, else gated. `ranges`: the share of those with two that are caught, of all
-objects, by the slant range of the bin. The models are `height_two_rw`, on the grid for the floors
-without objects.
+objects, by the slant range of the bin.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.bathymetry_paper import WALKS
+from benchmarks.bathymetry_paper import EXACT_ARRAY
 from benchmarks.study import Parts, study
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Snapshot
@@ -41,7 +40,6 @@ from sonar_imm_tools.simulation.bathymetry.objects import (
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, snr
 
 SIZES = {'ledge': (0.8, 3.0), 'box': (1.0, 4.0), 'wall': (2.0, 6.0), 'boulder': (0.6, 2.0)}
-ON_GRID: dict[str, Any] = {**WALKS, 'engine': 'grid', 'grid_step': 0.05}
 FAINT = {'snr_near_db': 20.0, 'snr_far_db': 0.0}
 THERMAL = {'noise_fades': False}
 BANDS = ((17.0, 30.0), (30.0, 40.0), (40.0, 50.0), (50.0, 77.0))
@@ -105,7 +103,7 @@ def count(bins: Bins, snapshot: Snapshot, facets: Facets) -> None:
     double, single = number >= 2, (power > 0.0).sum(axis=1) == 1
     estimates = []
     for value in ('gated', 'ignored'):
-        config = BathymetryConfig(layover=value, seed=1, **WALKS)
+        config = BathymetryConfig(layover=value, seed=1, **EXACT_ARRAY)
         (estimate,) = BathymetryTracker(config).process(snapshot)
         estimates.append(estimate)
     gated, ignored = (estimate.extras['valid'] > 0 for estimate in estimates)
@@ -155,7 +153,7 @@ def lost(name: str, pings: int, seed: int) -> dict[str, float]:
     """Bins of a floor without objects that are gated, and the worst ping."""
     scene_name, changes = FLAT[name]
     config = scenario(scene_name, {'pings': pings, **changes})
-    values = {**config.instruments(), **ON_GRID, 'layover': 'gated'}
+    values = {**config.instruments(), **EXACT_ARRAY, 'layover': 'gated'}
     tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
     parts = []
     for item in simulate(config, seed).measurements:

@@ -10,8 +10,7 @@
 
     python -m benchmarks.bathymetry_resolved --out docs/results/bathymetry_resolved.json
 
-The pings of `bathymetry_layover`, with objects of other seeds, under ``layover: resolved``
-and by the same models.
+The pings of `bathymetry_layover`, with objects of other seeds, under ``layover: resolved``.
 `caught`: share of the bins with two surfaces that get both heights; `doubt`: that are neither
 (no sounding); `silent`: without an echo; `false`: share of the bins of one surface that get two.
 Of bins with two heights: `rmse`, both against the nearest surface that answers, `inside` two
@@ -39,8 +38,8 @@ from attrs import evolve
 import numpy as np
 from scipy.signal import resample
 
-from benchmarks.bathymetry_layover import by_range, FLAT, objects, ON_GRID, SIZES
-from benchmarks.bathymetry_paper import WALKS
+from benchmarks.bathymetry_layover import by_range, FLAT, objects, SIZES
+from benchmarks.bathymetry_paper import EXACT_ARRAY
 from benchmarks.layover_tables import circular
 from benchmarks.speed.bathymetry import bench_layover
 from benchmarks.study import Parts, rms, study, truths
@@ -146,7 +145,7 @@ def off_facets(found: FloatArray, chosen: BoolArray, facets: Facets) -> FloatArr
 
 
 def tracked(snapshot: Snapshot, layover: str = 'resolved') -> Estimate:
-    config = BathymetryConfig(layover=layover, seed=1, **WALKS)
+    config = BathymetryConfig(layover=layover, seed=1, **EXACT_ARRAY)
     (estimate,) = BathymetryTracker(config).process(snapshot)
     return estimate
 
@@ -164,7 +163,7 @@ def floors(name: str, pings: int, seed: int) -> dict[str, float]:
     """Bins of a floor without objects that get two heights, or become no sounding for doubt."""
     scene_name, changes = FLAT[name]
     config = scenario(scene_name, {'pings': pings, **changes})
-    values = {**config.instruments(), **ON_GRID, 'layover': 'resolved'}
+    values = {**config.instruments(), **EXACT_ARRAY, 'layover': 'resolved'}
     tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
     false = doubt = bins = 0
     for item in simulate(config, seed).measurements:
@@ -185,7 +184,7 @@ def below_ship(kind: str, pings: int, seed: int) -> dict[str, float]:
         placed = {'object': kind, 'object_size': size, 'object_distance': distance, 'pings': 4}
         config = scenario('moving_ledge', placed)
         scene = simulate(config, int(rng.integers(1 << 31)))
-        values = config.instruments() | WALKS
+        values = config.instruments() | EXACT_ARRAY
         values |= {'navigation': 'required', 'layover': 'resolved'}
         tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
         made = [each for item in scene.measurements for each in tracker.process(item.measurement)]
@@ -223,7 +222,7 @@ def two_levels(name: str, up: float, pings: int, seed: int) -> dict[str, float]:
     higher = scenario(name, {**flat, 'sonar_height': config.sonar_height - up})
     scene = simulate(config, seed)
     floors = truths(scene, TrueProfile), truths(simulate(higher, seed), TrueProfile)
-    values = config.instruments() | WALKS
+    values = config.instruments() | EXACT_ARRAY
     values |= {'navigation': 'required', 'layover': 'resolved'}
     tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
     made, number = [], 0

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Raw arrivals in the field: two receivers, single ranges, few receivers a ping.
+"""Raw arrivals in the field: two receivers, and single ranges.
 
     python -m benchmarks.diver_arrivals --out docs/results/diver_arrivals.json
 
@@ -17,10 +17,6 @@ transponder that stands; `ship on a line`; `one receiver`. NEES of 2 is due; `in
 in the 95 % ellipse; `sure and wrong` the share of runs of which a fifth of the estimates have a
 NEES above 50; `begins s` is the median of the first confirmed estimate; `tracked` of the runs have
 one. Side A and side B are in the estimate, so its RMSE is half their distance.
-
-`receivers a ping`: of eight receivers about, so many hear a ping (2 % wild, .3 m of path); `echo`
-has a transmitter, `tag` none, in steps of 1 s and of 29 s, as far apart as those of the towed tag.
-The ratio is that of the RMSE of the default to that of `heading_speed` alone.
 """
 
 from __future__ import annotations
@@ -40,10 +36,6 @@ from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 STD, SOUND = 0.5, 1500.0
 SETTLED, WRONG = 10, 50.0
 BUOYS = np.array([[-40.0, -40.0], [40.0, -40.0], [40.0, 40.0], [-40.0, 40.0]])
-POOL = np.array(
-    [[0, 0], [70, 10], [-60, 45], [10, 85], [-40, -60], [80, -50], [120, 70], [-90, -10]], float
-)
-"""Receivers of `receivers a ping`."""
 
 Places = Callable[[int, np.random.Generator], FloatArray]
 """Where receivers (k, 2) ask at a ping."""
@@ -85,13 +77,11 @@ def transponder(stamp_ns: int, at: FloatArray, target: FloatArray, rng: Any) -> 
     )
 
 
-def followed(pings: list[Arrivals], track: TrueTrack, **values: Any) -> Score:
+def followed(pings: list[Arrivals], track: TrueTrack) -> Score:
     """Track a diver; estimates without a confirmed track are left out."""
     at = {int(stamp): k for k, stamp in enumerate(track.stamp_ns)}
     rows: list[tuple[float, float, float]] = []
-    for stamp, estimate in sorted(
-        final_estimates(DiverTracker(DiverConfig(**values)), pings).items()
-    ):
+    for stamp, estimate in sorted(final_estimates(DiverTracker(DiverConfig()), pings).items()):
         for row in np.flatnonzero(estimate.extras['track_state'] > 0)[:1]:
             error = estimate.state[row, :2] - track.position[at[stamp], :2]
             nees = error @ np.linalg.solve(estimate.covariance[row, :2, :2], error)
@@ -170,78 +160,11 @@ def row_of(scores: list[Score], first: int, last: int) -> dict[str, float | None
     }
 
 
-# -- few receivers a ping ------------------------------------------------------------------------
-
-KINDS: dict[str, tuple[bool, dict[str, Any]]] = {
-    'echo, 1 s': (False, {'duration': 99.0}),
-    'tag, 1 s': (True, {'duration': 99.0}),
-    'tag, 29 s': (True, {'duration': 2000.0, 'step': 29.0, 'turn_deg': 180.0}),
-}
-
-
-def thinned(seed: int, receivers: int, passive: bool, track: TrueTrack) -> list[Arrivals]:
-    """Pings that some of the receivers hear."""
-    rng, std = np.random.default_rng([51, seed, receivers]), 0.3
-    pings = []
-    for stamp, target in zip(track.stamp_ns, track.position[:, :2]):
-        own = np.sort(rng.permutation(len(POOL))[:receivers])
-        length = np.hypot(*(POOL[own] - target).T) + std * rng.normal(size=receivers)
-        length += (0.0 if passive else np.hypot(*target)) * np.ones(receivers)
-        length += (rng.random(receivers) < 0.02) * rng.uniform(5.0, 50.0, receivers)
-        nothing = np.full(receivers, np.nan)
-        pings.append(
-            Arrivals(
-                stamp_ns=int(stamp),
-                tx_id=np.zeros(receivers),
-                rx_id=own,
-                tx=np.full((receivers, 3), np.nan if passive else 0.0),
-                rx=np.column_stack([POOL[own], np.zeros(receivers)]),
-                toa=length / SOUND + (5.0 if passive else 0.0),
-                var_toa=np.full(receivers, (std / SOUND) ** 2),
-                bearing=nothing,
-                var_bearing=nothing,
-                frame_id='map',
-            )
-        )
-    return pings
-
-
-def few(kind: str, receivers: int, seeds: range) -> dict[str, float]:
-    """The default and `heading_speed` alone."""
-    passive, values = KINDS[kind]
-    square: dict[str, list[FloatArray]] = {'families': [], 'heading_speed': []}
-    nees: list[FloatArray] = []
-    for seed in seeds:
-        track = path(seed, **values)
-        pings = thinned(seed, receivers, passive, track)
-        for model_set, found in square.items():
-            score = followed(pings, track, max_tracks=1, model_set=model_set)
-            late = score.ping >= SETTLED
-            found.append(score.square[late])
-            if model_set == 'families':
-                nees.append(score.nees[late])
-    ours, theirs = (
-        float(np.sqrt(np.concatenate(square[name]).mean()))
-        for name in ('families', 'heading_speed')
-    )
-    return {
-        'RMSE': ours,
-        'heading_speed': theirs,
-        'ratio': ours / theirs,
-        'NEES': float(np.concatenate(nees).mean()),
-    }
-
-
-def main(runs: int = 20, first: int = 100, only: tuple[str, ...] = (*SCENES, *KINDS)) -> Parts:
+def main(runs: int = 20, first: int = 100, only: tuple[str, ...] = tuple(SCENES)) -> Parts:
     yield {'runs': runs, 'first': first}
-    seeds = range(first, first + runs)
     for name in only:
-        if name in SCENES:
-            yield {'table': scene(name, seeds)}
-            continue
-        for receivers in (5, 4, 3):
-            yield {'few': {f'{name}, {receivers} receivers': few(name, receivers, seeds)}}
+        yield {'table': scene(name, range(first, first + runs))}
 
 
 if __name__ == '__main__':
-    study(main, only={'choices': [*SCENES, *KINDS]})
+    study(main, only={'choices': list(SCENES)})

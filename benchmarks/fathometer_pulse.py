@@ -18,40 +18,21 @@ negative; ``strong 32`` and ``signed 32`` under the array of the drift; a tenth 
 each run. What is in the file already is kept. P is the share of records whose number of
 reflectors is right; OSPA of second order with a cutoff of 2 m; wrong signs per record. The first
 five records are not scored.
-
-``ghosts``: what a response without any noise holds besides the layers, in units of one record's
-noise: the matrices are the exact ones, the layers are fitted with either pulse and taken off, and
-the largest peaks further than 0.4 m from any layer are listed, each with the nearest place
-z_i + z_j - z_k. MVDR is no linear function of the matrices, so that echoes that interfere beat.
-Then, with the strongest layer alone, what its echo leaves by distance, its phase left in and taken
-off. Then the exact echo of one layer (what changes with the sign of its amplitude) beside the
-pulses of processor and band, by distance, and how much of it there is in each octave, against W,
-as it is ('all noise') and with the share of the surface only ('processor').
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from attrs import evolve
 import numpy as np
 
 from benchmarks import fathometer_paper
 from benchmarks.study import known, mean_of, Parts, rms, standard_error, study
-from sonar_imm.acoustics.fathometer import (
-    coherence_and_power,
-    echo_spectrum,
-    steering,
-    surface_share,
-)
-from sonar_imm.acoustics.pulse import band_pulse, Pulse
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import CrossSpectra
-from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
-from sonar_imm_tools.simulation.fathometer.field import expected_csdm
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of
 from sonar_imm_tools.simulation.fathometer.simulator import (
     cross_spectra,
@@ -156,154 +137,6 @@ def run(
     }
 
 
-class Exact(NamedTuple):
-    """Exact cross-spectra of some of the layers of ``strong``, seen by the tracker: depth (n,) of
-    the layers, z (m,), and responses (m,) in units of one record's noise with the phase of echoes
-    left in and taken off; the pulse of the processor."""
-
-    depth: np.ndarray
-    z: np.ndarray
-    plain: np.ndarray
-    turned: np.ndarray
-    pulse: Pulse
-
-    def left(self, seen: np.ndarray, pulse: Pulse) -> np.ndarray:
-        """`seen` (m,) without the layers, fitted with `pulse` at the nearest cells."""
-        at = np.abs(self.z[:, None] - self.depth).argmin(axis=0)
-        a = np.linalg.solve(pulse(self.z[at][:, None] - self.z[at]), seen[at])
-        return np.asarray(seen - pulse(self.z[:, None] - self.z[at]) @ a)
-
-
-def seen_exactly(count: int, **changes: Any) -> Exact:
-    """The first `count` layers, with these parameters changed."""
-    config, floor, rng = layers(0, 1, SIGNS['strong'])
-    floor = evolve(floor, depth=DEPTHS[None], array_depth=np.array([config.array_depth]))
-    there = Drift(
-        floor.depth[:, :count],
-        floor.amplitude[:, :count],
-        floor.present[:, :count],
-        floor.array_depth,
-        floor.array_depth_stated,
-    )
-    first = np.ceil(config.frequency_min * config.snapshot_seconds)
-    last = np.floor(config.frequency_max * config.snapshot_seconds)
-    frequency = np.arange(first, last + 1.0) / config.snapshot_seconds
-    exact = CrossSpectra(
-        stamp_ns=1, frequency=frequency, csdm=expected_csdm(config, there, 0, frequency)
-    )
-    settings = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
-    settings |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
-    settings |= {'noise_depth_min': 0.0, 'noise_depth_max': 0.0, **changes}
-    tracked = FathometerConfig(**settings, pulse='processor')
-    lattice = lattice_of_array(config.array_depth, tracked)
-    response = array_response(exact, lattice, tracked, config.array_depth)
-    plain = array_response(exact, lattice, evolve(tracked, pulse='band'), config.array_depth)
-    drawn = cross_spectra(config, floor, 0, config.array_depth, rng)
-    sigma = float(array_response(drawn, lattice, tracked, config.array_depth).sigma[0])
-    assert response.pulse is not None
-    return Exact(
-        there.depth[0],
-        response.depth,
-        plain.amplitude / sigma,
-        response.amplitude / sigma,
-        response.pulse,
-    )
-
-
-def peaks_beside() -> dict[str, list[dict[str, float]]]:
-    """The largest peaks beside the layers of ``strong``, by pulse."""
-    exact, config = seen_exactly(len(DEPTHS)), scenario('pressure')
-    triples = (DEPTHS[:, None, None] + DEPTHS[:, None] - DEPTHS).ravel()
-    band = band_pulse(config.frequency_min, config.frequency_max, config.sound_speed)
-    found = {}
-    for name, pulse, seen in (
-        ('band', band, exact.plain),
-        ('processor', exact.pulse, exact.turned),
-    ):
-        left = exact.left(seen, pulse)
-        left[np.abs(exact.z[:, None] - DEPTHS).min(axis=1) <= 0.4] = 0.0
-        size = np.abs(left)
-        peaks = 1 + np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:]))
-        largest = peaks[np.argsort(-size[peaks])][:8]
-        found[name] = [
-            {
-                'depth': float(exact.z[k]),
-                'sigmas': float(left[k]),
-                'nearest z_i + z_j - z_k': float(triples[np.abs(triples - exact.z[k]).argmin()]),
-            }
-            for k in largest
-        ]
-    return found
-
-
-def tails() -> dict[str, dict[str, float]]:
-    """What the echo of the strongest layer alone leaves, largest within .1 m of each distance,
-    with its phase left in and taken off, in units of one record's noise."""
-    # The layer stands on a cell.
-    exact = seen_exactly(1, depth_step=0.05)
-    found: dict[str, dict[str, float]] = {}
-    for name, seen in (('phase left in', exact.plain), ('phase off', exact.turned)):
-        left = exact.left(seen, exact.pulse)
-        row = found[name] = {}
-        for away in (-0.9, -0.7, -0.5, -0.3, 0.3, 0.5, 0.7, 0.9):
-            near = left[np.abs(exact.z - exact.depth[0] - away) <= 0.1]
-            row[f'{away:g} m'] = float(near[np.abs(near).argmax()])
-    return found
-
-
-ARRAYS = {
-    '32 hydrophones, 50-4000 Hz': (FathometerScenario(snapshot_seconds=0.35), 57.0),
-    '16 hydrophones, 100-2800 Hz': (scenario('pressure', {'snapshot_seconds': 0.35}), 22.0),
-}
-"""Scene and the height of the array above a layer of amplitude 0.35."""
-
-
-def echoes() -> dict[str, dict[str, dict[str, float]]]:
-    """The echo of one layer, without noise, and the pulses that are taken for it."""
-    tables = {}
-    for name, (config, height) in ARRAYS.items():
-        layer = np.array([[config.array_depth + height]])
-        where = np.array([config.array_depth])
-        floor = Drift(layer, np.full((1, 1), 0.35), layer > 0.0, where, where)
-        rows = np.arange(
-            np.ceil(config.frequency_min * config.snapshot_seconds),
-            np.floor(config.frequency_max * config.snapshot_seconds) + 1.0,
-        )
-        frequency = rows / config.snapshot_seconds
-        R = expected_csdm(config, floor, 0, frequency)
-        mirrored = evolve(floor, amplitude=-floor.amplitude)
-        heights = config.element_spacing * np.arange(config.phones)
-        w = steering(frequency, heights, config.sound_speed)
-        gamma, power = coherence_and_power(R, w, 'mvdr')
-        other = coherence_and_power(expected_csdm(config, mirrored, 0, frequency), w, 'mvdr')[0]
-        turn = np.exp(4j * np.pi * frequency * height / config.sound_speed)
-        gamma = 0.5 * (gamma - other)
-        echo = (gamma * turn).real
-        every = echo_spectrum(R, frequency, power)
-        W = every * surface_share(R, frequency, heights, config.sound_speed)
-        W = W / W.mean()
-        table: dict[str, dict[str, float]] = {}
-        for away in (0.05, 0.1, 0.2, 0.3, 0.5):
-            shift = np.exp(4j * np.pi * frequency * away / config.sound_speed)
-            table[f'pulse at {away} m'] = {
-                'echo': float((gamma * turn * shift).real.mean() / echo.mean()),
-                'processor': float((W * shift).real.mean()),
-                'all noise': float((every * shift).real.mean()),
-                'band': float(shift.real.mean()),
-            }
-        for low in (50.0, 100.0, 200.0, 400.0, 800.0, 1600.0):
-            octave = (frequency >= low) & (frequency < 2.0 * low)
-            if octave.any():
-                table[f'{low:.0f} Hz to {2 * low:.0f} Hz'] = {
-                    'echo': float(echo[octave].mean() / echo.mean()),
-                    'processor': float(W[octave].mean()),
-                    'all noise': float(every[octave].mean()),
-                    'band': 1.0,
-                }
-        tables[name] = table
-    return tables
-
-
 def _score(found: Estimate, depth: np.ndarray, amplitude: np.ndarray) -> list[float]:
     z = fathometer_paper.reflectors(found)
     away = z[:, :1] - depth
@@ -323,13 +156,9 @@ def main(
     scenes: Sequence[str] = tuple(SCENES),
     pulses: Sequence[str] = ('band', 'processor'),
     polarities: Sequence[str] = ('positive', 'both'),
-    ghosts: bool = False,
     out: Path | None = None,
 ) -> Parts:
     yield known(out)
-    if ghosts:
-        yield {'ghosts': peaks_beside(), 'tails': tails(), 'echoes': echoes()}
-        return
     yield {'records': records}
     for name in scenes:
         length = records if name == 'drift' else max(10, records // 10)
@@ -344,4 +173,4 @@ def main(
 
 
 if __name__ == '__main__':
-    study(main, ghosts={'help': 'only these, and echoes'}, scenes={'choices': list(SCENES)})
+    study(main, scenes={'choices': list(SCENES)})

@@ -6,27 +6,24 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What the detector of images finds, misses and invents, and how long it takes.
+"""What the detector of images finds, misses and invents.
 
     python -m benchmarks.image_detector --out docs/results/image_detector.json
 
 Images are those of the simulated sonar (256 beams, 600 ranges), which knows nothing of the
-detector. `study` is what an independent prototype reached on images of its own. `margins` are
-false detections by `threshold_margin_db` on images of other seeds than those that are scored, so
-that the margin can be chosen on images it is not scored on.
+detector. `margins` are false detections by `threshold_margin_db` on images of other seeds than
+those that are scored, so that the margin can be chosen on images it is not scored on.
 `--parts` makes some of the tables only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-import time
 from typing import Any
 
 import numpy as np
 
 from benchmarks.study import Parts, study
-from sonar_imm.acoustics.cfar import quiet_level, tail_factor
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, SonarImage
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
@@ -49,27 +46,13 @@ FLOORS = {
 MARGINS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
 CHOSEN_ON, SCORED_ON = 101, 1
 """Seeds of the images without a target."""
-STUDY_FALSE = {
-    'without the margin': {'Rayleigh': 0.1, 'K 4': 1.7, 'K 1.5': 7.3},
-    'as it is': {'Rayleigh': 0.0, 'K 4': 0.08, 'K 1.5': 0.2},
-}
 LEVELS = (12.0, 15.0, 18.0, 21.0)
-STUDY_FOUND = {'steady': (0.33, 0.95, 1.0, 1.0), 'rayleigh': (0.36, 0.58, 0.73, 0.88)}
-STUDY_CENTROID = {
-    15.0: (0.09, 0.024),
-    18.0: (0.06, 0.017),
-    21.0: (0.04, 0.011),
-    27.0: (0.02, 0.006),
-}
-"""Degrees and metres by SNR, dB."""
+FADINGS = ('steady', 'rayleigh')
 NEAR = 2.0
 PARTS = (
     'several targets',
-    'speed',
     'margins',
     'false detections per image',
-    'threshold above Rayleigh, dB',
-    'centroids',
     'found',
 )
 
@@ -106,30 +89,10 @@ def false_alarms(
     return table
 
 
-def price(images: int) -> dict[str, float]:
-    """By how many dB the threshold lies above what Rayleigh noise asks for, at the median of the
-    ranges that show the sea floor."""
-    rules, config, table = DetectorConfig().rules(), scene(), {}
-    onset = config.altitude / np.sin(np.radians(0.5 * config.vertical_fov_deg))
-    for floor, (shape, patch) in FLOORS.items():
-        factor = []
-        for number in range(images):
-            rng = np.random.default_rng([SCORED_ON, number])
-            sonar = ImageSonar(scene(seabed_shape=shape, seabed_patch=patch), rng)
-            power = np.square(image(sonar, []).amplitude)
-            *_, rough = quiet_level(
-                power, beams=rules.beams, training=rules.training, guard=rules.guard
-            )
-            rough = rough[sonar.range > onset]
-            factor.append(np.median(tail_factor(rough, rules.false_alarm)))
-        table[floor] = float(10.0 * np.log10(rules.margin * np.mean(factor)))
-    return table
-
-
 def found(runs: int) -> dict[str, dict[str, list[float]]]:
     """Share of images in which a point is found; it lies before the onset of the sea floor."""
     table: dict[str, dict[str, list[float]]] = {}
-    for fading in STUDY_FOUND:
+    for fading in FADINGS:
         for level in LEVELS:
             values = {'target_fading': fading, 'target_snr_db': level, 'altitude': 5000.0}
             rng = np.random.default_rng(2)
@@ -152,35 +115,6 @@ def place(r: float, b: float) -> np.ndarray:
 
 def near(ping: Detections, r: float, b: float, reach: float = NEAR) -> np.ndarray:
     return np.hypot(ping.range - r, (ping.bearing - b) * r) < reach
-
-
-def centroids(runs: int) -> list[dict[str, float]]:
-    """Error of the place of a point, and whether its variance is believed."""
-    rows = []
-    for level in STUDY_CENTROID:
-        rng = np.random.default_rng(3)
-        sonar = ImageSonar(scene(target_snr_db=level, altitude=5000.0), rng)
-        errors, nees = [], []
-        for _ in range(runs):
-            r, b = rng.uniform(25.0, 90.0), rng.uniform(-0.3, 0.3)
-            ping = detect(image(sonar, [place(r, b)]), DetectorConfig(threshold_margin_db=0.0))
-            for i in np.flatnonzero(near(ping, r, b))[:1]:
-                error = np.array([ping.range[i] - r, ping.bearing[i] - b])
-                errors.append(error)
-                assert ping.var_range is not None and ping.var_bearing is not None
-                nees.append(np.square(error) / [ping.var_range[i], ping.var_bearing[i]])
-        rms = np.sqrt(np.mean(np.square(errors), axis=0))
-        rows.append(
-            {
-                'snr_db': level,
-                'found': len(errors) / runs,
-                'range_m': float(rms[0]),
-                'bearing_deg': float(np.degrees(rms[1])),
-                'nees_range': float(np.mean(nees, axis=0)[0]),
-                'nees_bearing': float(np.mean(nees, axis=0)[1]),
-            }
-        )
-    return rows
 
 
 def several_targets(scenes: int) -> dict[str, Any]:
@@ -237,39 +171,15 @@ def several_targets(scenes: int) -> dict[str, Any]:
     }
 
 
-def speed(rounds: int) -> dict[str, float]:
-    """Processor time of one image with five points in it, ms."""
-    sonar = ImageSonar(scene(target_snr_db=22.0), np.random.default_rng(5))
-    spots = [place(r, b) for r, b in ((30, 0.1), (44, -0.2), (60, 0.0), (75, 0.25), (90, -0.1))]
-    picture = image(sonar, spots)
-    detect(picture, DetectorConfig())
-    spent = []
-    for _ in range(rounds):
-        start = time.process_time()
-        detect(picture, DetectorConfig())
-        spent.append(1e3 * (time.process_time() - start))
-    return {'p50_ms': float(np.median(spent)), 'p90_ms': float(np.percentile(spent, 90))}
-
-
 def main(
     runs: int = 120, images: int = 24, scenes: int = 20, parts: Sequence[str] = PARTS
 ) -> Parts:
-    yield {
-        'images': images,
-        'runs': runs,
-        'snr_db': LEVELS,
-        'study, false': STUDY_FALSE,
-        'study, found': STUDY_FOUND,
-        'study, centroids': STUDY_CENTROID,
-    }
+    yield {'images': images, 'runs': runs, 'snr_db': LEVELS}
     margins = {f'{margin:g} dB': DetectorConfig(threshold_margin_db=margin) for margin in MARGINS}
     made: tuple[Callable[[], Any], ...] = (
         lambda: several_targets(scenes),
-        lambda: speed(60),
         lambda: false_alarms(images, margins, CHOSEN_ON),
         lambda: false_alarms(images, DETECTORS, SCORED_ON),
-        lambda: price(6),
-        lambda: centroids(runs),
         lambda: found(runs),
     )
     for name, make in zip(PARTS, made):

@@ -258,7 +258,7 @@ class Landmark(DepthSlices):
         P[..., 0, 0] = np.trace(mixture.P[..., :2, :2], axis1=-2, axis2=-1)
         P[..., 1, 1] = P[..., 0, 0] / np.square(away)
         P[..., 2, 2] = mixture.P[..., 2, 2]
-        return mixtures.visible(m, P, mixture.mu, *self._beam)
+        return mixtures.visible(m, P, mixture.mu, self._beam)
 
     def _measure(self, points: FloatArray, sonar: Sonar) -> FloatArray:
         out = geometry.to_body(sonar.pose, points[..., :3])

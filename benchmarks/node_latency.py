@@ -19,14 +19,13 @@ to a plain rclpy node that answers with a PointCloud2 without fields, of as many
 estimate had: what is left is the cost of the middleware and of Python. Which of the two is asked
 first changes every time. `--rates`: so many such pairs a second, or one after the other (0). Needs
 ROS 2. The load is that of the machine in the last minute, jobs that run or wait; with more of them
-than cores p99 is mostly waiting for a core. The last table is where the node's own time goes,
-measured in this process.
+than cores p99 is mostly waiting for a core.
 """
 
 from __future__ import annotations
 
 import array
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 import math
 import os
@@ -40,11 +39,10 @@ import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from benchmarks.study import Parts, study
-from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import inputs_of
 from sonar_imm.nodes.messages import make
 from sonar_imm.nodes.qos import lockstep_qos, output_qos
@@ -204,39 +202,6 @@ def _assigned(name: str, value: Any) -> str:
     return f'{name}:={list(value) if isinstance(value, tuple) else value}'
 
 
-def parts(case: Case) -> dict[str, float]:
-    """Median milliseconds of each step of the node, without the middleware."""
-    entries = {entry.name: entry for entry in inputs_of(case.system)}
-    system = SYSTEMS[case.system]
-    tracker = system.build(system.config_type()(**case.options))
-    tracker.warm()
-    spent: dict[str, list[float]] = {}
-
-    def timed(name: str, call: Callable[..., Any], *args: Any) -> Any:
-        begin = time.perf_counter()
-        result = call(*args)
-        spent.setdefault(name, []).append(1e3 * (time.perf_counter() - begin))
-        return result
-
-    settings = tracker.config.as_dict()
-    readers = {
-        key: entry.reader(next(iter(entry.readers)), 'enu', settings, key)
-        for key, entry in entries.items()
-    }
-    for key, message in case.messages:
-        if key != case.timed:
-            tracker.process(readers[key](message))
-            continue
-        raw = serialize_message(message)
-        message = timed('deserialise', deserialize_message, raw, type(message))
-        measurement = timed('read', readers[key], message)
-        timed('look for doubts', entries[key].doubt, message, measurement)
-        estimate = timed('track', tracker.process, measurement)[-1]
-        answer = timed('write', write_estimate, estimate, make)
-        timed('serialise', serialize_message, answer)
-    return {name: float(np.median(values)) for name, values in spent.items()}
-
-
 def main(
     messages: int = 600,
     rates: Sequence[float] = (10.0, 50.0, 200.0),
@@ -258,12 +223,6 @@ def main(
                 row |= {f'{point} ms': node[k], f'{point} of a node that only answers': other[k]}
                 row[f'{point} ratio'] = node[k] / other[k]
             yield {'from message to estimate': {f'{name}, {rate:g} Hz': row}}
-        steps = parts(case_of(name, min(messages, 200)))
-        yield {
-            f'{name}: steps of the node, in one process': {
-                step: {'median ms': value} for step, value in steps.items()
-            },
-        }
 
 
 if __name__ == '__main__':

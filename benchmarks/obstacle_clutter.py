@@ -6,15 +6,21 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Obstacles in clutter, seldom seen, or with variances that are not true: what is tracked.
+"""Obstacles in clutter, seldom seen, with navigation that errs, and in scans that take seconds.
 
     python -m benchmarks.obstacle_clutter --runs 20 --out docs/results/obstacle_clutter.json
 
-Each run is the whole tracker at its defaults, told where the sonar sits. Where not said otherwise
-one obstacle is approached for 56 s at 2 Hz and shown in 19 of 20 pings. Clutter is added to the
-scene: `30 false` all over, `ring of 12` at 55 to 59 m (the onset of a sea floor), `sector of 12`
-between 10 and 16 degrees to starboard; each is a mean number in a ping. `field of 14` has
-obstacles of three kinds, eight of them fixed.
+Each run is the whole tracker at its defaults, told where the sonar sits and of its navigation what
+a `belief` says: nothing (`default`), that it has no errors that last (`exact`), or that it is a
+good inertial system (`good`). Where not said otherwise one obstacle is approached for 56 s at 2 Hz
+and shown in 19 of 20 pings.
+
+Clutter is added to the scene: `30 false` all over, `ring of 12` at 55 to 59 m (the onset of a sea
+floor), `sector of 12` between 10 and 16 degrees to starboard; each is a mean number in a ping.
+`field of 14` has obstacles of three kinds, eight of them fixed. Navigation drifts in any
+direction, the sonar is turned to either side, or poses come late, each untold. `scan of 9 s`: a
+sonar that turns by 40 degrees/s, at .5 m/s; each row has its time, and `GOSPA` and `missed` count
+pings at which the tracker published something.
 
 Of all pings in which the beam holds an obstacle: `GOSPA` of order 1 and cut 4 m, of confirmed
 tracks (a missed or false one costs 2), the share `missed`, and `false` tracks a ping; `false/h`
@@ -22,6 +28,12 @@ counts tracks that follow nothing for more than half of their pings, in an hour.
 median time from the first ping in the beam to a confirmed track, s, infinite where it was none;
 `place` the mean distance in the plane, m; `P` the mean probability of the true behaviour after 27
 s. `offset`, `NEES` and `band` are of the vertical offset between 60 and 40, and 40 and 25 m.
+`said`: share of the encounters after which users are told of a drift or of late poses; `good`:
+median of `navigation_good` at the end.
+
+`reliability` compares what is stated with what is true, by bins of what is stated, over all rows
+that are published of all scenes of a run: `existence`, of tentative tracks too, true where a real
+obstacle is nearest and within the cut; and the `behaviours` of rows that follow one.
 """
 
 from __future__ import annotations
@@ -35,7 +47,7 @@ import numpy as np
 from benchmarks.obstacle_accuracy import level, LEVER, true_level
 from benchmarks.study import final_estimates, Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import Detections, Measurement
+from sonar_imm.measurements import Detections, Measurement, Navigation
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
@@ -43,9 +55,53 @@ CUT = 4.0
 BANDS = ((60.0, 40.0), (40.0, 25.0))
 SETTLED = 27.0
 HALF = np.radians(22.5)
+SECOND = 1e9
+SWEEP = 9.0
+STATED = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
+"""Edges of the bins of a stated probability."""
+BELIEFS: dict[str, dict[str, Any]] = {
+    'default': {},
+    'exact': {'drift_std': 0.0, 'yaw_error_std_deg': 0.0, 'navigation_delay_std': 0.0},
+    'good': {'drift_std': 0.003, 'yaw_error_std_deg': 0.1, 'navigation_delay_std': 0.01},
+}
 
-Change = Callable[[Detections, float, np.random.Generator], Detections | None]
-"""A ping at a time, s, as it arrives; None where it is lost."""
+Change = Callable[[list[Measurement], int], list[Measurement]]
+"""The measurements of an encounter as they arrive; by seed."""
+
+
+def each_ping(
+    change: Callable[[Detections, float, np.random.Generator], Detections | None],
+) -> Change:
+    """One ping at a time, s; None where it is lost."""
+
+    def changed(given: list[Measurement], seed: int) -> list[Measurement]:
+        rng, start, out = np.random.default_rng(seed + 1000), None, []
+        for item in given:
+            if isinstance(item, Detections):
+                start = item.stamp_ns if start is None else start
+                if (ping := change(item, (item.stamp_ns - start) / SECOND, rng)) is None:
+                    continue
+                item = ping
+            out.append(item)
+        return out
+
+    return changed
+
+
+def each_pose(change: Callable[[Navigation, float], Navigation]) -> Change:
+    """One pose at a time, s; in the order of the stamps that they then have."""
+
+    def changed(given: list[Measurement], seed: int) -> list[Measurement]:
+        start = given[0].stamp_ns
+        moved = [
+            change(each, (each.stamp_ns - start) / SECOND)
+            if isinstance(each, Navigation)
+            else each
+            for each in given
+        ]
+        return sorted(moved, key=lambda each: each.stamp_ns)
+
+    return changed
 
 
 def false_ones(
@@ -62,7 +118,7 @@ def false_ones(
         )
         return evolve(more, frame_id=ping.frame_id)
 
-    return change
+    return each_ping(change)
 
 
 def told(factor: float) -> Change:
@@ -77,29 +133,106 @@ def told(factor: float) -> Change:
             var_bearing=np.full(n, factor * bearing_std**2),
         )
 
-    return change
+    return each_ping(change)
 
 
 def silent(first: float, last: float) -> Change:
     """No ping between two times, s."""
-    return lambda ping, t, rng: None if first <= t < last else ping
+    return each_ping(lambda ping, t, rng: None if first <= t < last else ping)
+
+
+def drifting(speed: float) -> Change:
+    """Navigation that drifts by so much, m/s, in any direction."""
+
+    def changed(given: list[Measurement], seed: int) -> list[Measurement]:
+        way = np.random.default_rng(seed + 2000).uniform(0.0, 2.0 * np.pi)
+        drift = speed * np.array([np.cos(way), np.sin(way), 0.0])
+        drifts = each_pose(lambda each, t: evolve(each, position=each.position + t * drift))
+        return drifts(given, seed)
+
+    return changed
+
+
+def turned(angle_deg: float) -> Change:
+    """A sonar that is turned by so much to either side."""
+
+    def changed(given: list[Measurement], seed: int) -> list[Measurement]:
+        side = np.random.default_rng(seed + 2000).choice([-1.0, 1.0])
+        off = np.radians(angle_deg) * side
+        turns = each_ping(lambda each, t, rng: evolve(each, bearing=each.bearing + off))
+        return turns(given, seed)
+
+    return changed
+
+
+def late(delay: float) -> Change:
+    """Poses that are stamped so many seconds late."""
+    return each_pose(lambda each, t: evolve(each, stamp_ns=each.stamp_ns + round(delay * SECOND)))
+
+
+def scanned(given: list[Measurement], seed: int) -> list[Measurement]:
+    """The pings of which a beam that turns from port to starboard, once in `SWEEP` s, sees the
+    echo, as scans that are stamped at their end."""
+    pings = [each for each in given if isinstance(each, Detections)]
+    others: list[Measurement] = [each for each in given if not isinstance(each, Detections)]
+    rate = 2.0 * np.pi / SWEEP
+    count, scans = round(SWEEP * SLOW['ping_rate']), []
+    for first in range(0, len(pings) - count, count):
+        scan = pings[first : first + count]
+        end = scan[-1].stamp_ns
+        ago = np.array([(each.stamp_ns - end) / SECOND for each in scan])
+        beam = np.pi - (ago - ago[0]) * rate
+        rows = [
+            (each.range[i], each.bearing[i], t)
+            for each, t, b in zip(scan, ago, beam)
+            for i in range(len(each))
+            if abs(each.bearing[i] - b) <= 0.5 * rate / SLOW['ping_rate']
+        ]
+        r, b, t = np.array(rows).reshape(-1, 3).T
+        scans.append(
+            evolve(
+                Detections(stamp_ns=end, range=r, bearing=b, time_offset=t),
+                frame_id=scan[0].frame_id,
+            )
+        )
+    return sorted([*others, *scans], key=lambda each: each.stamp_ns)
 
 
 BOTH_SIDES = {'vertical_offset': 0.0, 'offset_spread': 6.0}
 ALL_OVER = false_ones(30.0, 1.0, 100.0)
+SLOW = {'speed': 0.5, 'ping_rate': 10.0}
 FIELD = {'spacing': 5.0, 'passing_distance': 15.0, **BOTH_SIDES}
+# As long on the way as those that stay, with other obstacles.
+SWAYING = {**FIELD, 'first_range': 78.0, 'last_range': -6.0}
+MOVING = {**FIELD, 'first_range': 66.0, 'last_range': -18.0}
+SLOWLY = {'obstacle_speed': [0.1, 0.3]}
 KINDS_OF_14 = [
     ('approach', {'obstacles': 8, **FIELD}),
-    # As long on the way, with other obstacles.
-    ('swaying', {'obstacles': 3, 'first_range': 78.0, 'last_range': -6.0, **FIELD}),
-    ('mover', {'obstacles': 3, 'first_range': 66.0, 'last_range': -18.0, **FIELD}),
+    ('swaying', {'obstacles': 3, **SWAYING}),
+    ('mover', {'obstacles': 3, **MOVING}),
 ]
 SCENES: dict[str, tuple[Sequence[tuple[str, dict[str, Any]]], Change | None]] = {
     'fixed, +3 m': ([('approach', {})], None),
     'fixed, +-6 m': ([('approach', BOTH_SIDES)], None),
     'swaying, +-6 m': ([('swaying', BOTH_SIDES)], None),
     'moving .3-1.5 m/s': ([('mover', {})], None),
-    'moving .1-.3 m/s': ([('mover', {'obstacle_speed': [0.1, 0.3]})], None),
+    'moving .1-.3 m/s': ([('mover', SLOWLY)], None),
+    'moving .1-.3 m/s, 3 fixed': (
+        [
+            ('approach', {**FIELD, 'obstacles': 3}),
+            ('mover', {**SLOWLY, 'first_range': 78.0, 'last_range': -6.0}),
+        ],
+        None,
+    ),
+    '4 fixed': ([('approach', {**FIELD, 'obstacles': 4})], None),
+    '4 of 3 kinds': (
+        [
+            ('approach', {**FIELD, 'obstacles': 2}),
+            ('swaying', {**SWAYING, 'obstacles': 1}),
+            ('mover', {**MOVING, 'obstacles': 1}),
+        ],
+        None,
+    ),
     '30 false': ([('approach', {})], ALL_OVER),
     'ring of 12': ([('approach', {})], false_ones(12.0, 55.0, 59.0)),
     'sector of 12': (
@@ -115,16 +248,22 @@ SCENES: dict[str, tuple[Sequence[tuple[str, dict[str, Any]]], Change | None]] = 
     'R told x 9': ([('approach', {})], told(9.0)),
     'field of 14': (KINDS_OF_14, None),
     'field of 14, 30 false': (KINDS_OF_14, ALL_OVER),
+    'drift .02': ([('approach', {})], drifting(0.02)),
+    'drift .05': ([('approach', {})], drifting(0.05)),
+    'drift .05, 4 fixed': ([('approach', {**FIELD, 'obstacles': 4})], drifting(0.05)),
+    'yaw 2 deg': ([('approach', {})], turned(2.0)),
+    '.5 s late': ([('approach', {})], late(0.5)),
+    '1.5 s late': ([('approach', {})], late(1.5)),
+    'scan of 9 s': ([('approach', {**SLOW, 'detection_probability': 1.0})], scanned),
 }
-"""Scenes of one seed, whose obstacles are all there, and what is done to the pings."""
+"""Scenes of one seed, whose obstacles are all there, and what is done to the measurements."""
 KINDS = {'approach': 'fixed', 'swaying': 'swaying', 'mover': 'moving'}
 
 
-def encounter(
-    parts: Sequence[tuple[str, dict[str, Any]]], change: Change | None, seed: int
-) -> tuple[list[Measurement], list[tuple[str, TrueObstacle]]]:
-    """The measurements of an encounter, and the obstacles with what they do. Scenes of one seed
-    have the same vehicle."""
+def encounter(name: str, seed: int) -> tuple[list[Measurement], list[tuple[str, TrueObstacle]]]:
+    """The measurements of a scene, and its obstacles with what they do. Parts of one seed have the
+    same vehicle."""
+    parts, change = SCENES[name]
     scenes = []
     for kind, values in parts:
         seen = {'detection_probability': 0.95, **values}
@@ -135,26 +274,19 @@ def encounter(
         for item in scene.measurements:
             if isinstance(item.measurement, Detections):
                 pings.setdefault(item.measurement.stamp_ns, []).append(item.measurement)
-    rng = np.random.default_rng(seed + 1000)
-    measurements, start = [], min(pings)
+    measurements = []
     for item in scenes[0][1].measurements:
         given = item.measurement
         if isinstance(given, Detections):
             together = pings[given.stamp_ns]
-            ping = evolve(
-                Detections(
-                    stamp_ns=given.stamp_ns,
-                    range=np.concatenate([each.range for each in together]),
-                    bearing=np.concatenate([each.bearing for each in together]),
-                ),
-                frame_id=given.frame_id,
+            ping = Detections(
+                stamp_ns=given.stamp_ns,
+                range=np.concatenate([each.range for each in together]),
+                bearing=np.concatenate([each.bearing for each in together]),
             )
-            changed = change(ping, (given.stamp_ns - start) * 1e-9, rng) if change else ping
-            if changed is None:
-                continue
-            given = changed
+            given = evolve(ping, frame_id=given.frame_id)
         measurements.append(given)
-    return measurements, obstacles
+    return change(measurements, seed) if change else measurements, obstacles
 
 
 def matched(points: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -182,6 +314,8 @@ class Sums:
         self.behaviour: dict[str, list[float]] = {}
         self.offset: list[list[tuple[float, float, float]]] = [[] for _ in BANDS]
         self.switches = 0
+        self.existence: list[tuple[float, bool]] = []
+        self.stated: list[tuple[float, bool]] = []
 
     def add(self, final: dict[int, Estimate], obstacles: list[tuple[str, TrueObstacle]]) -> None:
         """Add one encounter."""
@@ -199,6 +333,9 @@ class Sums:
             rows = np.flatnonzero(sure)
             ids = estimate.extras['track_id'][rows]
             true = np.array([true_level(truth, ping) for _, truth in obstacles])
+            real = set(matched(points, true).tolist())
+            for row, r in enumerate(estimate.extras['existence'].tolist()):
+                self.existence.append((r, row in real))
             found = matched(points[rows], true)
             inside = np.array([truth.in_beam[ping] for _, truth in obstacles])
             for row, track in enumerate(ids.tolist()):
@@ -234,6 +371,8 @@ class Sums:
         t: float,
     ) -> None:
         does, truth = obstacle
+        for kind in KINDS.values():
+            self.stated.append((float(estimate.extras[f'prob_{kind}'][row]), kind == does))
         if t > SETTLED:
             p = float(estimate.extras[f'prob_{does}'][row])
             self.behaviour.setdefault(does, []).append(p)
@@ -268,21 +407,58 @@ class Sums:
         return {**found, 'switches': float(self.switches)}
 
 
-def scene(name: str, runs: int, first: int = 0) -> dict[str, float]:
-    """One row of the table."""
-    sums = Sums()
+def binned(stated: Sequence[tuple[float, bool]]) -> dict[str, dict[str, float]]:
+    """By bins of what is stated: number of rows, mean of it, and share that is true."""
+    p, true = np.array(stated, float).reshape(-1, 2).T
+    which = np.digitize(p, STATED[1:-1])
+    found = {}
+    for k, (low, high) in enumerate(zip(STATED, STATED[1:])):
+        if (own := which == k).any():
+            found[f'{low:g}-{high:g}'] = {
+                'rows': int(own.sum()),
+                'stated': float(p[own].mean()),
+                'true': float(true[own].mean()),
+            }
+    return found
+
+
+def scene(name: str, belief: str, runs: int, first: int = 0) -> tuple[dict[str, float], Sums]:
+    """One row of the table, and its sums."""
+    sums, good, said = Sums(), [], 0
     for seed in range(first, first + runs):
-        measurements, obstacles = encounter(*SCENES[name], seed)
-        config = ObstacleConfig(sonar_lever=LEVER['sonar_lever'])
-        sums.add(final_estimates(ObstacleTracker(config), measurements), obstacles)
-    return {'runs': runs, **sums.row()}
+        given, obstacles = encounter(name, seed)
+        config = ObstacleConfig(sonar_lever=LEVER['sonar_lever'], **BELIEFS[belief])
+        tracker = ObstacleTracker(config)
+        sums.add(final_estimates(tracker, given), obstacles)
+        good.append(tracker.health()['navigation_good'])
+        said += any('navigation drifts' in each or 'poses' in each for each in tracker.warnings())
+    row = {'runs': runs, **sums.row(), 'said': said / runs}
+    known = [value for value in good if np.isfinite(value)]
+    return row | ({'good': float(np.median(known))} if known else {}), sums
 
 
-def main(runs: int = 20, first: int = 0, scenes: Sequence[str] = tuple(SCENES)) -> Parts:
-    """Yield a row for each scene."""
+def main(
+    runs: int = 20,
+    first: int = 0,
+    scenes: Sequence[str] = tuple(SCENES),
+    beliefs: Sequence[str] = ('default',),
+) -> Parts:
+    """Yield a row for each scene and belief, then how reliable what is stated was."""
+    existence: list[tuple[float, bool]] = []
+    stated: list[tuple[float, bool]] = []
     for name in scenes:
-        yield {'scenes': {name: scene(name, runs, first)}}
+        for belief in beliefs:
+            row, sums = scene(name, belief, runs, first)
+            existence += sums.existence
+            stated += sums.stated
+            yield {'scenes': {name if belief == 'default' else f'{name}, {belief}': row}}
+    yield {'reliability': {'existence': binned(existence), 'behaviours': binned(stated)}}
 
 
 if __name__ == '__main__':
-    study(main, first={'help': 'first seed'}, scenes={'choices': list(SCENES)})
+    study(
+        main,
+        first={'help': 'first seed'},
+        scenes={'choices': list(SCENES)},
+        beliefs={'choices': list(BELIEFS)},
+    )

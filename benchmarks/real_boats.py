@@ -24,8 +24,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from benchmarks.real_recordings import boat_scores, BOATS, HEADINGS
-from benchmarks.recordings import autoferry, DATA
+from benchmarks.recordings import autoferry, boat_scores, BOATS, DATA, HEADINGS
 from benchmarks.study import final_estimates, Parts, study
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fixes

@@ -6,18 +6,17 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Every real recording of divers and boats in one table each: the default, its single families,
-conventional filters, and a peer.
+"""Every real recording of divers and boats in one table each: the default, two of its families
+alone, a constant velocity, and a peer.
 
     export SONAR_IMM_DATA=../shared/data
-    python -m benchmarks.recording_scores --out docs/results/recording_scores.json
+    python -m benchmarks.recording_scores --no-thinning --out docs/results/recording_scores.json
+    python -m benchmarks.recording_scores --recordings --out docs/results/recording_thinned.json
 
-`plain CV Kalman` is that of `real_boats`; the peer is FilterPy's Kalman filter with the noise of
-ours, which takes the fixes of a tag one by one and knows no clutter. Tags are
-compared with GPS 3.4 s later, boats with GNSS within 20 m of a track; `seen` is the share of what
-there was to see that has a confirmed track, `ids` counts their identities. Of raw arrivals the
-tables hold pings of three or more. `thinned` is the RMSE with fewer receivers, chosen in eight
-ways.
+The peer, `plain CV Kalman`, is that of `real_boats`. Tags are compared with GPS 3.4 s later, boats
+with GNSS within 20 m of a track; `seen` is the share of what there was to see that has a confirmed
+track, `ids` counts their identities. Of raw arrivals the tables hold pings of three or more.
+`thinned` is the RMSE with fewer receivers, chosen in eight ways.
 """
 
 from __future__ import annotations
@@ -28,11 +27,12 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from filterpy.kalman import KalmanFilter
 import numpy as np
 
 from benchmarks.real_boats import PlainKalman
-from benchmarks.real_recordings import (
+from benchmarks.recordings import (
+    autoferry,
+    DATA,
     HEADINGS,
     LAG,
     PACE,
@@ -41,12 +41,11 @@ from benchmarks.real_recordings import (
     tag_scores,
     thinned,
 )
-from benchmarks.real_recordings import load as load_bag
-from benchmarks.recordings import autoferry, DATA
+from benchmarks.recordings import load as load_bag
 from benchmarks.study import final_estimates, Parts, study
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
-from sonar_imm.measurements import Fix, Fixes
+from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.recordings.convert import convert_arrivals, convert_fixes
@@ -57,11 +56,8 @@ WAYS, RECEIVERS = 8, (5, 4, 3)
 CUTOFF, NINETY_FIVE, LONGEST_GAP = 20.0, 5.991, 60.0
 SINGLE: dict[str, dict[str, Any]] = {
     'CV Kalman': {'model_set': 'bench_cv', 'acceleration_noise': (NOISE,)},
-    'IMM CV+CV': {'model_set': 'bench_cv_cv', 'acceleration_noise': (0.01, 0.12)},
     'steady alone (heading_speed)': HEADINGS,
     'brisk alone': PACE,
-    'lively alone': {'model_set': 'bench_cv_cv', 'acceleration_noise': (0.05, 0.6)},
-    'quiet alone': {'model_set': 'bench_cv', 'acceleration_noise': (0.03,)},
 }
 THINNED = ('CV Kalman', 'steady alone (heading_speed)', 'brisk alone')
 RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -141,38 +137,6 @@ def scores(estimates: Sequence[Estimate], truth: np.ndarray, tag: bool) -> dict[
     }
 
 
-class Peer:
-    """FilterPy's Kalman filter with our noise, for one target, each fix as it comes."""
-
-    def __init__(self, scale: float):
-        self.scale, self.stamp_ns = scale, 0
-        self.filter = KalmanFilter(dim_x=4, dim_z=2)
-        self.filter.H = np.eye(2, 4)
-
-    def process(self, fix: Fix) -> list[Estimate]:
-        z, R = fix.position[:2], np.asarray(fix.covariance)[:2, :2] * self.scale
-        kalman, dt = self.filter, (fix.stamp_ns - self.stamp_ns) * 1e-9
-        if not self.stamp_ns:
-            kalman.x, kalman.P = np.append(z, [0.0, 0.0]), np.diag([*np.diag(R), 1.0, 1.0])
-        else:
-            kalman.F = np.kron([[1.0, dt], [0.0, 1.0]], np.eye(2))
-            q = NOISE**2 * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
-            kalman.predict(Q=np.kron(q, np.eye(2)))
-            kalman.update(z, R=R)
-        self.stamp_ns = fix.stamp_ns
-        return [
-            Estimate(
-                stamp_ns=fix.stamp_ns,
-                frame_id='map',
-                xyz=np.zeros((1, 3), np.float32),
-                state_names=('px', 'py', 'vx', 'vy'),
-                state=np.reshape(kalman.x, (1, 4)),
-                covariance=np.reshape(kalman.P, (1, 4, 4)),
-                extras={'track_id': np.ones(1, int), 'track_state': np.ones(1, int)},
-            )
-        ]
-
-
 def trackers(kind: str, stated: dict[str, Any]) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Each tracker of a recording by its name."""
     clutter = {'clutter_density': 1e-5} if kind in BOATS else {}
@@ -183,8 +147,6 @@ def trackers(kind: str, stated: dict[str, Any]) -> Iterator[tuple[str, Callable[
     yield 'default', lambda: DiverTracker(DiverConfig(**stated))
     for name, values in SINGLE.items():
         yield name, partial(ours, values)
-    if kind == 'fixes':
-        yield 'FilterPy, CV Kalman', lambda: Peer(stated.get('covariance_scale', 1.0))
     if kind in BOATS:
         yield 'plain CV Kalman', lambda: PlainKalman(0.3, stated['fix_std'], 3, 5)
 

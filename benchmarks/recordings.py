@@ -5,7 +5,11 @@
 # writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
-"""The Autoferry sensor fusion data set: radar and lidar detections of boats, with clutter, in NED.
+"""Real recordings, read and scored: a towed acoustic tag (yaps) and boats (Autoferry).
+
+`recording_scores` and `real_boats` print what docs/results/recordings.md shows. Truth of the tag
+is a hand-held GPS, itself good to a few metres and ahead of the tag, which is towed: errors are
+given against GPS as it is and against GPS 3.4 s later.
 
 A record of ``scenario13_detections.json`` is one scan of one sensor: ``measurement`` is 2 x M,
 north then east relative to the own ship (a flat pair for M = 1, empty for none), and
@@ -24,7 +28,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_imm.measurements import Fixes
+from msg_adapters.estimates import read_estimate
+from sonar_imm.estimates import Estimate
+from sonar_imm.estimation.consistency import gospa
+from sonar_imm.measurements import Arrivals, Fix, Fixes, Rejection
+from sonar_imm.trackers.diver.births import locate_fix
+from sonar_imm.trackers.diver.tracker import DiverConfig
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.reader import BagReader
 
 DATA = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data'))
 SENSORS = {'lidar': 1, 'radar': 2}
@@ -78,3 +89,137 @@ def truth_of(groups: Any) -> NDArray[np.float64]:
 def _nanoseconds(seconds: float) -> int:
     """A double resolves about 0.2 us today."""
     return round(seconds * 1e9)
+
+
+LAG = 3.4
+
+TAG: dict[str, Any] = {
+    'max_tracks': 1,
+    'confirm_hits': 1,
+    'max_coast': 600.0,
+    'sound_speed': 1545.0,
+    'target_z': -1.0,
+    'toa_std': 0.0009,
+}
+"""What a user knows: one tag, silent for half a minute at a time, a metre deep, in water of this
+sound speed, with receivers of this accuracy. Everything else is at its default."""
+
+BOATS: dict[str, Any] = {'speed_mean': 2.0, 'speed_std': 1.5, 'speed_noise': 0.1}
+HEADINGS: dict[str, Any] = {'model_set': 'heading_speed'}
+PACE: dict[str, Any] = {**HEADINGS, 'speed_noise': 0.07}
+"""A swimmer whose speed, spread by `speed_std` = .4 m/s, is another one after a minute: a random
+walk of sqrt(2 / 60 s) .4 m/s over a second, as that of a process that forgets within a minute."""
+COLUMNS = ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing')
+
+
+def load(bag: Path) -> tuple[list, np.ndarray]:
+    """Measurements of a bag, and truth as rows (stamp s, id, x, y)."""
+    with BagReader(bag) as reader:
+        found = [item.measurement for item in measurements_of(reader, 'diver')]
+    truth = []
+    with BagReader(bag) as reader:
+        for item in reader.messages(['/truth/estimate']):
+            table = read_estimate(item.message)
+            truth += [
+                (table.stamp_ns * 1e-9, int(i), x, y)
+                for i, x, y in zip(
+                    table.extras['track_id'], table.extras['px'], table.extras['py']
+                )
+            ]
+    return [each for each in found if not isinstance(each, Rejection)], np.array(truth)
+
+
+def against_gps(
+    stamps: np.ndarray, places: np.ndarray, truth: np.ndarray, lag: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Error (k, 2) at the stamps inside the GPS recording and not inside one of its gaps, and
+    which stamps those are."""
+    t = stamps + lag
+    after = np.clip(np.searchsorted(truth[:, 0], t), 1, len(truth) - 1)
+    good = (
+        (t >= truth[0, 0]) & (t <= truth[-1, 0]) & (truth[after, 0] - truth[after - 1, 0] < 60.0)
+    )
+    there = np.column_stack([np.interp(t, truth[:, 0], truth[:, c]) for c in (2, 3)])
+    return (places - there)[good], good
+
+
+def tag_scores(estimates: list, truth: np.ndarray) -> list[float]:
+    """RMSE as it is and with the lag, median, NEES with the lag."""
+    rows = [
+        (e.stamp_ns * 1e-9, e.state[0, :2], e.covariance[0, :2, :2]) for e in estimates if len(e)
+    ]
+    stamps, places, covariances = (np.array(column) for column in zip(*rows))
+    plain, _ = against_gps(stamps, places, truth, 0.0)
+    lagged, good = against_gps(stamps, places, truth, LAG)
+    squared = np.einsum(
+        'ki,ki->k', lagged, np.linalg.solve(covariances[good], lagged[..., None])[..., 0]
+    )
+    distance = np.hypot(*lagged.T)
+    return [
+        np.sqrt(np.mean(np.sum(plain**2, 1))),
+        np.sqrt(np.mean(distance**2)),
+        np.median(distance),
+        squared.mean(),
+        len(distance),
+    ]
+
+
+def raw_fixes(items: list, config: DiverConfig) -> list[Estimate]:
+    """The fixes themselves, or those that each ping gives by itself, as tracks without a past."""
+    rows = []
+    for item in items:
+        if isinstance(item, Fix):
+            assert item.covariance is not None
+            covariance = config.covariance_scale * item.covariance[:2, :2]
+            rows.append((item.stamp_ns, item.position[:2], covariance))
+        elif isinstance(item, Arrivals):
+            fix = locate_fix(item, np.arange(len(item)), config)
+            rows += [(item.stamp_ns, fix.position, fix.covariance)] if fix else []
+    alone = {'track_state': np.ones(1, np.uint8)}
+    return [
+        Estimate(
+            stamp_ns=stamp_ns,
+            frame_id='map',
+            xyz=np.zeros((1, 3), np.float32),
+            state_names=('px', 'py'),
+            state=place[None, :2],
+            covariance=np.asarray(covariance)[None],
+            extras={**alone, 'track_id': np.array([number])},
+        )
+        for number, (stamp_ns, place, covariance) in enumerate(rows)
+    ]
+
+
+def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
+    """Fewer receivers per ping, and fewer pings."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for ping in items:
+        rows = np.sort(rng.permutation(len(ping))[:receivers])
+        if rng.uniform() < keep and len(rows) > 1:
+            columns = {name: getattr(ping, name)[rows] for name in COLUMNS}
+            out.append(Arrivals(stamp_ns=ping.stamp_ns, frame_id=ping.frame_id, **columns))
+    return out
+
+
+def boat_scores(final: dict, truth: np.ndarray) -> list[float]:
+    distance, missed, false, ids, squared = [], 0, 0, set(), []
+    for stamp in sorted(final):
+        estimate = final[stamp]
+        rows = estimate.extras['track_state'] > 0
+        present = []
+        for number in np.unique(truth[:, 1]):
+            path = truth[truth[:, 1] == number]
+            if path[0, 0] <= stamp * 1e-9 <= path[-1, 0]:
+                present.append([np.interp(stamp * 1e-9, path[:, 0], path[:, c]) for c in (2, 3)])
+        result = gospa(np.reshape(present, (-1, 2)), estimate.state[rows, :2], 20.0, 2)
+        distance.append(result.distance)
+        pairs = [(i, j) for i, j in enumerate(result.estimate_of) if j >= 0]
+        missed += len(present) - len(pairs)
+        false += int(rows.sum()) - len(pairs)
+        squared += [
+            np.sum((np.array(present[i]) - estimate.state[rows, :2][j]) ** 2) for i, j in pairs
+        ]
+        ids.update(estimate.extras['track_id'][rows].tolist())
+    n = len(final)
+    return [np.mean(distance), missed / n, false / n, len(ids), np.sqrt(np.mean(squared))]

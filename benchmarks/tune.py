@@ -70,7 +70,7 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
             'diver',
             'as modelled',
             {'fixes': '100', 'factor': str(factor)},
-            {'model_set': 'heading_speed'},
+            {},
             'covariance_scale',
             factor,
         )
@@ -156,7 +156,7 @@ def _written(out: Path, places: list[np.ndarray], variance: float = 1.0) -> None
 
 
 def tow_tag(out: Path, seed: int) -> None:
-    """The fixes of the towed tag (`real_recordings`)."""
+    """The fixes of the towed tag (`recordings`)."""
     if not DATA.is_dir():
         raise SystemExit(f'no recordings at {DATA}: set SONAR_IMM_DATA')
     convert_fixes(DATA / 'yaps_ssu1' / 'fixes.csv', out)

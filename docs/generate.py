@@ -85,7 +85,7 @@ MATTER = {
         'dimensions': '3 when the depth is wanted, from fixes with z or from arrival times',
         'detection_probability': 'divers are seen in fewer, or more, scans than nine of ten',
         'clutter_density': 'false fixes per square metre and scan, when you know them',
-        'coverage_sector': 'the sensor sees a sector only: who leaves it is not deleted',
+        'coverage_sector': 'the sensor sees a sector only: a target outside of it is not deleted',
         'sound_speed': 'arrival times: that of your water; with `sound_speed_std` if unsure',
         'receiver_position_std': 'arrival times: how well receivers were surveyed',
     },

@@ -140,9 +140,17 @@ class Numbers:
         self.captioned |= set(files)
         return f'{text}\n\n<small>{"; ".join(map(self.made, files))}</small>'
 
-    def has(self, file: str) -> bool:
-        """Return whether there is such a file."""
-        return (self.folder / f'{file}.json').is_file()
+    def has(self, path: str) -> bool:
+        """Return whether there is something at a path, for what only some files hold."""
+        try:
+            self.at(path)
+        except (LookupError, FileNotFoundError):
+            return False
+        return True
+
+    def keys(self, path: str, part: str = '') -> list[str]:
+        """Return the names at a path that contain `part`; none where the path leads nowhere."""
+        return [name for name in self.at(path) if part in name] if self.has(path) else []
 
     def sources(self) -> str:
         """Return one line with the files that were read so far and stand below no table."""
@@ -155,7 +163,9 @@ def rendered(template: Path, folder: Path = RESULTS) -> str:
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     numbers = Numbers(folder)
-    functions = {name: getattr(numbers, name) for name in ('n', 'table', 'has', 'made', 'sources')}
+    functions = {
+        name: getattr(numbers, name) for name in ('n', 'table', 'has', 'keys', 'made', 'sources')
+    }
     text = environment.from_string(template.read_text(encoding='utf-8')).render(functions)
     return text.rstrip() + '\n'
 

@@ -9,9 +9,9 @@
 """Position fixes and starts of tracks: in metres (geometry_msgs PoseWithCovarianceStamped or
 PointStamped), relative to a vessel, and in latitude and longitude.
 
-Publishers fill in covariances in different ways. Of the x-y block a negative variance means
-unknown. All zeros mean that it was not filled in: unknown too, and worth a warning (see
-`doubt_fix`). Anything else has to be finite, symmetric and positive definite, or the fix is
+Publishers fill in covariances in different ways. Of the x-y block a negative variance or a number
+that is not finite means unknown. All zeros mean that it was not filled in: unknown too, and worth
+a warning (see `doubt_fix`). Anything else has to be symmetric and positive definite, or the fix is
 refused. What is stated of z is used with it, or left out where it cannot be true
 (`measurements.in_space`).
 
@@ -186,7 +186,7 @@ def known_covariance(message: Any) -> NDArray[np.float64] | None:
     if covariance is None:
         return None
     block = covariance[:2, :2]
-    if block.any() and not (np.diag(block) < 0.0).any():
+    if _is_stated(block):
         check_covariance(block, 'a fix')
         return covariance
     covariance[:2], covariance[:, :2] = np.nan, np.nan
@@ -324,11 +324,15 @@ def _in_axes(
 
 
 def _stated(values: Any) -> np.ndarray | None:
-    """The part of x y z (3, 3); None when it is unknown: negative on the diagonal or all zero."""
+    """The part of x y z (3, 3); None when it is unknown, see `_is_stated`."""
     block = square(values, 6)[:3, :3]
-    if not block.any() or (np.diag(block) < 0.0).any():
-        return None
-    return block
+    return block if _is_stated(block) else None
+
+
+def _is_stated(block: NDArray[np.float64]) -> bool:
+    """Whether a covariance is stated. Drivers say that it is not by numbers that are not finite,
+    negative on the diagonal, or all zero."""
+    return bool(np.isfinite(block).all() and block.any() and (np.diag(block) >= 0.0).all())
 
 
 # -- in latitude and longitude -----------------------------------------------------------------

@@ -55,6 +55,11 @@ def _check_adapters() -> None:
 _check_adapters()
 
 
+def __dir__() -> list[str]:
+    """Return the names of `__all__` and the version, whether imported yet or not."""
+    return [*__all__, '__version__']
+
+
 def __getattr__(name: str) -> Any:
     """Import a name of `__all__` when it is first asked for: numpy and scipy take a moment."""
     if name not in __all__:

@@ -78,10 +78,12 @@ class BathymetryNodeConfig(NodeConfig):
 
 @frozen(kw_only=True)
 class TracksNodeConfig(NodeConfig):
-    """A late message has its window computed again: up to a second, while others go on coming."""
+    """A late message has its window computed again: up to a second, while others go on coming.
+    Whoever steers by a track needs the one of now."""
 
     # fmt: off
     queue_depth: int = inherited(NodeConfig, 'queue_depth', 500)
+    max_wait: float = inherited(NodeConfig, 'max_wait', 2.0)
     # fmt: on
 
 

@@ -30,7 +30,8 @@ for the docs.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+import copy
 import difflib
 from functools import lru_cache, partial
 from importlib.metadata import entry_points, EntryPoint
@@ -50,6 +51,8 @@ C = TypeVar('C', bound='Config')
 MODELS = 'sonar_imm.models'
 """The entry-point group of models of motion, see `trackers.own_models`."""
 KINDS = ('bool', 'int', 'float', 'str', 'float[]', 'int[]', 'str[]')
+MOST_NAMED, MOST_SHOWN = 20, 200
+"""Unknown parameters that are named, and characters of a value that is wrong."""
 MOST_YAML = 1_000_000
 """Characters of a YAML file, and values in it with its anchors written out."""
 _KEY = 'sonar_imm.parameter'
@@ -61,6 +64,12 @@ class ConfigError(ValueError):
     def __init__(self, *problems: str):
         self.problems = tuple(problems)
         super().__init__('; '.join(problems))
+
+
+def _shown(value: Any) -> str:
+    """A value as it was given, cut where nobody would read on."""
+    text = repr(value)
+    return text if len(text) <= MOST_SHOWN else f'{text[:MOST_SHOWN]}...'
 
 
 @frozen
@@ -85,7 +94,8 @@ class ParameterSpec:
         """Say what is wrong with `value`, or None when it is good."""
         if self.kind.endswith('[]'):
             if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
-                return f"parameter '{self.name}' must be a list of {self.kind[:-2]}, got {value!r}"
+                kind = self.kind.removesuffix('[]')
+                return f"parameter '{self.name}' must be a list of {kind}, got {_shown(value)}"
             for element in value:
                 trouble = self._scalar_problem(element, self.kind[:-2])
                 if trouble:
@@ -97,11 +107,13 @@ class ParameterSpec:
         name = f"parameter '{self.name}'"
         if kind == 'bool':
             return (
-                None if isinstance(value, bool) else f'{name} must be true or false, got {value!r}'
+                None
+                if isinstance(value, bool)
+                else f'{name} must be true or false, got {_shown(value)}'
             )
         if kind == 'str':
             if not isinstance(value, str):
-                return f'{name} must be text, got {value!r}'
+                return f'{name} must be text, got {_shown(value)}'
             if self.choices and value not in self.choices and not self._registered(value):
                 known = ', '.join(self.choices)
                 if self.group:
@@ -109,7 +121,7 @@ class ParameterSpec:
                 if gone := GONE.get(f'choice {self.name} {value}'):
                     return f"{name}: '{value}' {gone}"
                 hint = did_you_mean(value, self.choices)
-                return f"{name} must be one of {known}, got '{value}'{hint}"
+                return f'{name} must be one of {known}, got {_shown(value)}{hint}'
             return None
         if (
             isinstance(value, bool)
@@ -117,13 +129,13 @@ class ParameterSpec:
             or (kind == 'int' and not isinstance(value, int))
         ):
             wanted = 'a whole number' if kind == 'int' else 'a number'
-            return f'{name} must be {wanted}, got {value!r}'
+            return f'{name} must be {wanted}, got {_shown(value)}'
         if not abs(value) <= sys.float_info.max:  # whole numbers of JSON have no limit
-            return f'{name} must be finite, got {value!r}'
+            return f'{name} must be finite, got {_shown(value)}'
         if (self.low is not None and value < self.low) or (
             self.high is not None and value > self.high
         ):
-            return f'{name} must be {self.range_text()}, got {value!r} {self.unit}'.rstrip()
+            return f'{name} must be {self.range_text()}, got {_shown(value)} {self.unit}'.rstrip()
         return None
 
     def _registered(self, value: str) -> bool:
@@ -282,7 +294,7 @@ class Config:
         suggestion) and bad value."""
         specs = {spec.name: spec for spec in cls.specs_with(values)}
         unknown = [key for key in values if key not in specs]
-        problems = [] if ignore_unknown else [unknown_parameter(key, specs) for key in unknown]
+        problems = [] if ignore_unknown else unknown_parameters(unknown, specs)
         known = {key: value for key, value in values.items() if key in specs}
         problems += [
             trouble for key, value in known.items() if (trouble := specs[key].problem(value))
@@ -321,12 +333,17 @@ def small_text(path: Path, encoding: str = 'utf-8', errors: str = 'strict') -> s
 def yaml_tree(text: str) -> Any:
     """What a YAML text holds. Raises `ConfigError` for one that is none, or that would be much
     larger than it looks: an anchor (``&a``) that is used (``*a``) stands for all that it names."""
+    return copy.deepcopy(_tree(text))
+
+
+@lru_cache(maxsize=2)  # a file is asked for several nodes, and 400 kB take two seconds
+def _tree(text: str) -> Any:
     import yaml
 
     try:
         if len(text) > MOST_YAML:
             raise yaml.YAMLError(f'it has more than {MOST_YAML} characters')
-        if '*' in text:
+        if '*' in text and '&' in text:
             _written_out(yaml.compose(text, yaml.SafeLoader), {})
         return yaml.safe_load(text)
     except RecursionError:
@@ -452,11 +469,18 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f" (did you mean '{close[0]}'?)" if close else ''
 
 
-def unknown_parameter(name: str, known: Iterable[str]) -> str:
-    """Return the sentence for a parameter that does not exist, or no longer exists."""
-    if gone := GONE.get(f'parameter {name}'):
-        return f"parameter '{name}' {gone}"
-    return f"unknown parameter '{name}'{did_you_mean(name, known)}"
+def unknown_parameters(names: Sequence[str], known: Iterable[str]) -> list[str]:
+    """Return a sentence for each parameter that does not exist, or no longer exists; of many the
+    first ones."""
+    first = names[:MOST_NAMED]
+    sentences = [
+        f"parameter '{name}' {gone}"
+        if (gone := GONE.get(f'parameter {name}'))
+        else f"unknown parameter '{name}'{did_you_mean(name, known)}"
+        for name in first
+    ]
+    more = len(names) - len(first)
+    return [*sentences, *([f'{more} more unknown parameters'] if more else [])]
 
 
 def _field(spec: ParameterSpec) -> Any:

@@ -15,6 +15,7 @@ from helpers.anchors import multiplying
 from hypothesis import given
 from hypothesis import strategies as st
 import pytest
+import yaml
 
 from sonar_imm.parameters import (
     Config,
@@ -400,3 +401,36 @@ def test_any_text_is_a_mapping_or_refused(text):
     except ConfigError:
         return
     assert all(isinstance(key, str) for key in values)
+
+
+# -- much of it -----------------------------------------------------------------------------------
+
+
+def test_thousands_of_unknown_names_are_counted():
+    found = problems(**{f'speed{k:05d}': 1.0 for k in range(16_000)})
+    assert len(found) == 21
+    assert found[0] == "unknown parameter 'speed00000' (did you mean 'speed'?)"
+    assert found[-1] == '15980 more unknown parameters'
+
+
+@pytest.mark.parametrize('name', ['speed', 'calm', 'gait', 'name', 'steps', 'stops'])
+def test_a_long_value_is_cut(name):
+    value = 'y' * 400_000 if name in ('gait', 'stops') else ['y'] * 400_000
+    (found,) = problems(**{name: value})
+    assert 200 < len(found) < 400 and found.endswith('...')
+
+
+def test_a_file_is_parsed_once_however_often_it_is_asked(monkeypatch):
+    parsed = []
+    load = yaml.safe_load
+    monkeypatch.setattr(yaml, 'safe_load', lambda text: parsed.append(text) or load(text))
+    text = '/**:\n  ros__parameters:\n    stops: [1, 2]\n'
+    first = parameters_from_yaml(text, node_name='walker')
+    first['stops'].append(3)
+    assert parameters_from_yaml(text, node_name='runner') == {'stops': [1, 2]}
+    assert len(parsed) == 1
+
+
+def test_the_anchors_of_a_file_without_any_are_not_counted(monkeypatch):
+    monkeypatch.setattr(yaml, 'compose', None)
+    assert parameters_from_yaml('/**:\n  ros__parameters:\n    steps: 5\n') == {'steps': 5}

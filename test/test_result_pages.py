@@ -47,6 +47,13 @@ def test_a_number_has_two_decimals_or_its_format(numbers):
     assert numbers.n('x>scenes>calm>kept') == numbers.n('x>scenes>rough>RMSE') == '-'
 
 
+def test_what_only_some_files_hold_can_be_asked_for(numbers):
+    assert numbers.has('x>scenes>calm') and numbers.keys('x>scenes', 'ou') == ['rough']
+    for path in ('x>scenes>storm', 'x>runs>RMSE', 'y>scenes'):
+        assert not numbers.has(path) and numbers.keys(path) == []
+    assert numbers.sources() == '[x.json](x.json), 2026-11-29, commit abcd1234'
+
+
 @pytest.mark.parametrize('path', ['x>scenes>storm>RMSE', 'x>runs>RMSE', 'x>all>2', 'x>all>first'])
 def test_a_number_that_is_missing_is_named(numbers, path):
     with pytest.raises(LookupError, match=re.escape(path)):

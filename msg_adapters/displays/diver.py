@@ -9,7 +9,7 @@
 """Displays of divers: a PoseArray of all at once, and markers.
 
 Odometry comes one message per diver, and a display that keeps the newest message shows one diver.
-Each diver is drawn as an ellipse that holds 90 % of where he may be, an arrow to where he will be
+Each diver is drawn as an ellipse that holds 90 % of where it may be, an arrow to where it will be
 in a few seconds, and a label.
 """
 

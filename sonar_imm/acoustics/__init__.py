@@ -11,6 +11,7 @@ __all__ = [
     'array',
     'arrival_fit',
     'arrivals_3d',
+    'calibration',
     'cfar',
     'coherence',
     'envelopes',

@@ -37,7 +37,7 @@ from scipy.optimize import brentq
 
 from ..estimation.arrays import BoolArray, FloatArray
 from .array import direction_grid, phase_step
-from .laplace import autocorrelation
+from .laplace import weighted_form
 from .variances import moving_mean
 from .wave_kernels import beam_peaks
 
@@ -52,17 +52,23 @@ _LEVELS = 4096
 
 
 def coherence(
-    iq: NDArray, spacing: float, *, conjugate: bool = False
+    iq: NDArray,
+    spacing: float,
+    *,
+    conjugate: bool = False,
+    weights: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Coherence (n,) of snapshots iq (n, P) and the direction sine (n,) where it is reached; NaN
-    for bins that are not finite or silent."""
+    for bins that are not finite or silent. weights (P,): what the staves count, see
+    `laplace.form_coefficients`."""
     staves = iq.shape[1]
     grid = direction_grid(staves, spacing)
     phase = phase_step(spacing, conjugate=conjugate) * grid
     with np.errstate(invalid='ignore', over='ignore'):
-        form = autocorrelation(iq)
-        power = form[:, 0].real.copy()
+        form, power = weighted_form(iq, weights)
         form[:, 1:] *= 2.0
+    if weights is not None:
+        staves = int(np.count_nonzero(weights))
     peak, place = np.empty(len(iq)), np.empty(len(iq))
     row = np.empty(len(grid))
     beam_peaks(form, np.cos(phase), np.sin(phase), row, row.copy(), peak, place)

@@ -103,20 +103,38 @@ def autocorrelation(y: ArrayLike) -> ComplexArray:
     return out
 
 
+def weighted_form(
+    y: ArrayLike, weights: FloatArray | None = None
+) -> tuple[ComplexArray, FloatArray]:
+    """The autocorrelation (..., P) of w y and the power (...,) sum_p w_p |y_p|^2 of snapshots
+    y (..., P), whose staves have the weights w (P,), see `form_coefficients`; None for ones."""
+    if weights is None:
+        coefficients = autocorrelation(y)
+        return coefficients, coefficients[..., 0].real.copy()
+    y = np.asarray(y, np.complex128)
+    return autocorrelation(weights * y), np.square(np.abs(y)) @ weights
+
+
 def form_coefficients(
-    y: ArrayLike, signal_variance: ArrayLike, noise_variance: ArrayLike
+    y: ArrayLike,
+    signal_variance: ArrayLike,
+    noise_variance: ArrayLike,
+    weights: FloatArray | None = None,
 ) -> ComplexArray:
     """Coefficients g (..., P) of the quadratic form: q(u) = Re sum_k g_k exp(-i k w u).
 
-    y (..., P); variances (...) of signal and noise at one stave.
+    y (..., P); variances (...) of signal and noise at one stave. weights (P,) where the noise
+    differs from stave to stave: the noise variance is then the harmonic mean h over the staves
+    that are there, and h / w_p that of one; the others have the weight 0. With B = |sum_p w_p
+    conj(a_p) y_p|^2 and E = sum_p w_p |y_p|^2 the form is q = (E - kappa B) / h, exactly.
     """
     noise = np.asarray(noise_variance, np.float64)
-    staves = np.shape(y)[-1]
+    staves = np.shape(y)[-1] if weights is None else np.count_nonzero(weights)
     kappa = signal_variance / (noise + staves * np.asarray(signal_variance, np.float64))
-    coefficients = autocorrelation(y)
-    power = coefficients[..., 0].copy()
+    coefficients, power = weighted_form(y, weights)
+    own = coefficients[..., 0].real.copy()
     coefficients *= -2.0 * kappa[..., None]
-    coefficients[..., 0] = power * (1.0 - kappa)
+    coefficients[..., 0] = power * (1.0 - kappa) + kappa * (power - own)
     return coefficients / noise[..., None]
 
 

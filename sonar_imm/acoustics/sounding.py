@@ -87,11 +87,13 @@ class ErrorBudget:
 @frozen
 class GeometryDoubt:
     """Standard deviations of what an array and the water are known to: tilt, rad; the spacing of
-    the staves and the sound speed, as shares."""
+    the staves and the sound speed, as shares; sine: of all direction sines together, which phases
+    of staves leave."""
 
     tilt: float
     spacing: float
     sound_speed: float
+    sine: float = 0.0
 
 
 def geometry_variance(
@@ -104,6 +106,7 @@ def geometry_variance(
     same, and scales the ranges::
 
         (Y s_tilt)^2 + (s_spacing Y tan theta)^2 + s_c^2 (D + Y tan theta)^2
+        + (s_sine Y / cos theta)^2
 
     Consider parameters (Schmidt): nothing is estimated of them, since tilt is a slope of the floor
     and the others a bend.
@@ -111,6 +114,7 @@ def geometry_variance(
     D, Y = np.abs(depth), np.asarray(distance, np.float64)
     t = np.clip(np.tan(angle), -STEEPEST, STEEPEST)
     turned = doubt.tilt**2 + np.square(doubt.spacing * t)
+    turned += np.square(doubt.sine) * (1.0 + np.square(t))
     vertical = np.square(Y) * turned + np.square(doubt.sound_speed * (D + Y * t))
     horizontal = np.square(D) * turned + np.square(doubt.sound_speed * (Y - D * t))
     return vertical, horizontal

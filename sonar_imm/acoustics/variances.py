@@ -35,6 +35,8 @@ LEAST_SNR = 0.01
 """Signal variances are kept above this many noise variances: a silent bin has little
 weight then."""
 
+SMALLEST, LARGEST = 1e-60, 1e18
+"""Samples of a bin, in whatever unit."""
 AROUND, FURTHEST = 101, 31
 """Bins of the mean power by which correlated bins are weighed; the largest lag looked at."""
 BY_CHANCE, LEAST_EXCESS = 4.0, 0.02
@@ -42,9 +44,10 @@ BY_CHANCE, LEAST_EXCESS = 4.0, 0.02
 
 
 def usable_bins(iq: NDArray) -> BoolArray:
-    """Bins (n,) whose samples are all finite and not all zero."""
-    power = np.abs(iq).max(axis=1, initial=0.0)
-    return np.isfinite(iq).all(axis=1) & (power > 0.0) & (power < 1e18)
+    """Bins (n,) whose samples are all finite and not all zero, nor of a size at which squares of
+    powers are no numbers."""
+    largest = np.abs(iq).max(axis=1, initial=0.0)
+    return np.isfinite(iq).all(axis=1) & (largest > SMALLEST) & (largest < LARGEST)
 
 
 def mean_power(iq: NDArray) -> FloatArray:

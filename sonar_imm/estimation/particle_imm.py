@@ -22,8 +22,8 @@
 ...     log_likelihood=echo,
 ...     rng=rng,
 ... )
->>> for z in (20.0, 20.1, None, 20.0, 22.4, 23.9):  # m; None: no echo
-...     floor.step(z)
+>>> [floor.step(z) for z in (20.0, 20.1, None, 20.0, 22.4, 23.9)][-1]  # m; None: no echo
+'used'
 >>> floor.estimate.mean.round(0).tolist(), floor.model_probabilities.round(1).tolist()
 ([24.0], [0.0, 1.0])
 
@@ -54,7 +54,7 @@ from numpy.typing import ArrayLike
 
 from . import imm
 from .arrays import FloatArray
-from .imm_filter import Estimate
+from .imm_filter import Estimate, Verdict
 from .markov import ModelChain, RateChain
 from .particles import effective_sample_size, normalise, systematic
 
@@ -75,6 +75,7 @@ class ParticleIMM:
     impossible; one for all models or by name. rng: source of all randomness; the same seed and
     input give the same bytes. initial: (M,) model probabilities, uniform if not given.
     resample_below: least effective number of particles, as a share of N, that a model keeps.
+    stamp: of the start [s]; None: a step of `dt` before the first measurement, or its stamp.
 
     names: (M,); particles: (M, N, n), weights: (M, N), those of each model sum to one;
     model_probabilities: (M,); log_likelihood: of the newest measurement given those before it, NaN
@@ -94,6 +95,7 @@ class ParticleIMM:
         dt: float = 1.0,
         initial: ArrayLike | None = None,
         resample_below: float = 0.5,
+        stamp: float | None = None,
     ):
         self.names, self._moves = tuple(models), tuple(models.values())
         M = len(self.names)
@@ -127,18 +129,30 @@ class ParticleIMM:
         self.weights: FloatArray = np.full((M, N), 1.0 / N)
         self.model_probabilities = self._chain.initial
         self.log_likelihood = math.nan
+        self._stamp = stamp
 
-    def step(self, z: Any, dt: float | None = None) -> None:
-        """Mix, predict and update by a measurement `dt` seconds later, by default `dt` of the
-        filter.
+    def step(self, z: Any, dt: float | None = None, *, stamp: float | None = None) -> Verdict:
+        """Mix, predict and update by a measurement.
 
         :param z: anything that log_likelihood takes; None where nothing was measured.
-        :raises ValueError: for a negative dt, and for functions that give arrays of another shape,
-            particles that are not finite, or log-likelihoods that are NaN or +inf.
+        :param dt: seconds after the step before, by default `dt` of the filter.
+        :param stamp: time in s instead of dt.
+        :returns: ``used``, or ``too_late`` for a stamp before the newest, which changes nothing:
+            particles are not computed again.
+        :raises ValueError: for dt and stamp together or a dt below 0, and for functions that give
+            arrays of another shape, particles that are not finite, or log-likelihoods that are
+            NaN or +inf.
         """
-        seconds = self._chain.step if dt is None else dt
+        if stamp is not None and dt is not None:
+            raise ValueError('a step has dt or stamp, not both')
+        if stamp is not None:
+            seconds = stamp - (stamp if self._stamp is None else self._stamp)
+            if seconds < 0.0:
+                return 'too_late'
+        else:
+            seconds = self._chain.step if dt is None else dt
         if not 0.0 <= seconds < math.inf:
-            raise ValueError(f'dt is finite and cannot be negative, got {dt}')
+            raise ValueError(f'dt is finite and cannot be negative, got {seconds}')
         x, w, c = self._mixed(self._chain.over(seconds))
         x = np.stack([self._moved(j, each, seconds) for j, each in enumerate(x)])
         mu, found = c, math.nan
@@ -152,6 +166,13 @@ class ParticleIMM:
                 w, mu = np.where(log_L[:, None] > -math.inf, after, w), joint
         self.particles, self.weights = x, w
         self.model_probabilities, self.log_likelihood = mu, found
+        self._stamp = self.stamp + seconds if stamp is None else stamp
+        return 'used'
+
+    @property
+    def stamp(self) -> float:
+        """Time of the newest estimate [s]; 0 at the start if none was given."""
+        return 0.0 if self._stamp is None else self._stamp
 
     @property
     def estimate(self) -> Estimate:

@@ -16,7 +16,7 @@ from attrs import field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acoustics.variances import usable_bins
+from ..acoustics.variances import LARGEST, SMALLEST, usable_bins
 from ..estimation.arrays import FloatArray
 from .checks import check_stamp, column, complexes, positives, Rejection
 
@@ -78,12 +78,16 @@ class Snapshot:
                 )
         usable = usable_bins(self.iq)
         if not usable.any():
-            silent = np.isfinite(self.iq).all(axis=1).any()
+            finite = np.isfinite(self.iq).all(axis=1)
+            if not finite.any():
+                raise Rejection('nan', 'the snapshot has no bin whose samples are all finite')
+            largest = float(np.abs(self.iq[finite]).max())
+            if largest == 0.0:
+                raise Rejection('silent', 'the snapshot is silent in every bin')
             raise Rejection(
-                'silent' if silent else 'nan',
-                'the snapshot is silent in every bin'
-                if silent
-                else 'the snapshot has no bin whose samples are all finite',
+                'out_of_range',
+                f'the samples of the snapshot reach {largest:g}; {SMALLEST:g} to {LARGEST:g} are '
+                'possible',
             )
         usable.flags.writeable = False
         object.__setattr__(self, 'usable', usable)

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from ..estimation.arrays import FloatArray
 from ..texts import in_one_line
 
+LAST_NS = 2**31 * 10**9
+
 
 class Rejection(ValueError):
     """Input that cannot be used: `reason` is a short code for counters (``'nan'``), `sentence`
@@ -67,21 +69,26 @@ def nanoseconds(seconds: float) -> int:
 
 
 def check_stamp(stamp_ns: int) -> None:
-    """Raise `Rejection` for a stamp that is zero (never filled in), negative, or beyond the year
-    2262."""
-    if not 0 < stamp_ns < 2**63:
+    """Raise `Rejection` for a stamp that is zero (never filled in), negative, or later than ROS 2
+    can say."""
+    if not stamp_ns > 0:
         raise Rejection(
             'bad_stamp', f'the header stamp is {stamp_ns} ns; the sensor driver has to fill it in'
+        )
+    if not stamp_ns < LAST_NS:
+        raise Rejection(
+            'bad_stamp',
+            f'the header stamp is {stamp_ns} ns, beyond 2038-01-19: seconds in ROS 2 have 32 bits',
         )
 
 
 def positives(value: Any) -> FloatArray | None:
-    """Read-only (n,), NaN where the value is no variance or standard deviation, which are finite
-    and positive; None when none is."""
+    """Read-only (n,), NaN where the value is no variance or standard deviation, which are positive
+    and whose squares are numbers; None when none is."""
     if value is None:
         return None
     array = np.array(value, np.float64)
-    array[~(np.isfinite(array) & (array > 0.0))] = np.nan
+    array[~((array > 1e-150) & (array < 1e150))] = np.nan
     array.flags.writeable = False
     return None if np.isnan(array).all() else array
 

@@ -45,7 +45,7 @@ from ..measurements import Rejection
 from ..node_config import chosen_types, node_config_type
 from ..parameters import Config
 from ..trackers import SYSTEMS
-from .diagnostics import Announcer, Meter, Reporter
+from .diagnostics import Announcer, Meter, Reporter, Stamp, UNUSED_REASONS
 from .managed import DONE, FAILED, LOADING, LOOK, ManagedNode, Warming
 from .messages import is_installed, make, message_class
 from .outputs import DisplayPublisher, ProcessedPublisher, TablePublisher
@@ -175,8 +175,7 @@ class BaseNode(ManagedNode):
         topic, _, reader = self._inputs[name]
         stamp = message.header.stamp if hasattr(message, 'header') else None
         self._meter.arrived(name, start)
-        if stamp is not None:
-            self._meter.stamped(name, start - (stamp.sec + 1e-9 * stamp.nanosec))
+        unused = self.unused()
         self._received_ns = info['received_timestamp']
         if self._waited_too_long(name, info):
             self._acknowledge(stamp)
@@ -185,10 +184,15 @@ class BaseNode(ManagedNode):
             self.take(topic, reader, message)
         except Rejection as rejection:
             self._refuse(name, rejection)
+            unused = -1
         except Exception:
             if not self.context.ok():
                 raise  # the middleware went away under our feet: `run` knows
             self._recover(name)
+        if stamp is not None:
+            age = start - (stamp.sec + 1e-9 * stamp.nanosec)
+            used = unused == self.unused()
+            self._meter.stamped(name, Stamp(age, message.header.frame_id, used))
         self._acknowledge(stamp)
         self._meter.spent(time.monotonic() - start)
 
@@ -211,6 +215,10 @@ class BaseNode(ManagedNode):
     def take(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         """Do with a message what the node is there for. Raises `Rejection`."""
         raise NotImplementedError
+
+    def unused(self) -> int:
+        """How many messages were of no use so far."""
+        return 0
 
     def start_afresh(self) -> None:
         """Forget what came so far, after an internal error."""
@@ -359,10 +367,17 @@ class BaseNode(ManagedNode):
                 starting='' if self._hears else self._why_silent(),
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
-                publishers=self.count_publishers,
+                publishers=self._publishers_of,
                 **(NO_WORK if self._warming is None else self.work_report()),
             )
         )
+
+    def _publishers_of(self, topic: str) -> list[str]:
+        """The nodes that publish a topic, once for each publisher."""
+        return [
+            f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+            for info in self.get_publishers_info_by_topic(topic)
+        ]
 
     def _why_silent(self) -> str:
         """Why no input is heard."""
@@ -450,6 +465,11 @@ class TrackerNode(BaseNode):
         self.tracker = self._intake.tracker
         self._displays.clear()
         return True
+
+    def unused(self) -> int:
+        """How many messages the tracker could not use so far."""
+        counts = self.tracker.counts
+        return sum(counts[reason] for reason in counts.keys() & UNUSED_REASONS)
 
     def start_afresh(self) -> None:
         """Forget all measurements and take away what is drawn."""

@@ -78,6 +78,15 @@ UNUSED_SHARE, UNUSED_LEAST = 0.1, 5
 """The share, and the number of messages, from which on it is said."""
 
 
+class Stamp(NamedTuple):
+    """The stamp of a message. age: the time of arrival less it, s, from any zero; frame_id: of its
+    header; used: whether the message was of use."""
+
+    age: float
+    frame_id: str = ''
+    used: bool = True
+
+
 class Meter:
     """Arrivals of messages and time spent on them; times in seconds of the steady clock."""
 
@@ -89,7 +98,7 @@ class Meter:
         self.dropped: Counter[str] = Counter()
         self.first: dict[str, float] = {}
         self.last: dict[str, float] = {}
-        self.ages: dict[str, deque[float]] = {}
+        self.stamps: dict[str, deque[Stamp]] = {}
         self.estimates = Ages()
         self._durations: deque[float] = deque(maxlen=_WINDOW)
 
@@ -104,9 +113,9 @@ class Meter:
         self.refused[reason] += 1
         self.refused_on[topic] += 1
 
-    def stamped(self, topic: str, age: float) -> None:
-        """Note a stamp: `age` is the time of arrival less it, s, from any zero."""
-        self.ages.setdefault(topic, deque(maxlen=_AGES)).append(age)
+    def stamped(self, topic: str, stamp: Stamp) -> None:
+        """Note the stamp of a message."""
+        self.stamps.setdefault(topic, deque(maxlen=_AGES)).append(stamp)
 
     def interval(self, topic: str) -> float:
         """Mean seconds between the messages on `topic`; 0 where there were less than two."""
@@ -141,6 +150,28 @@ def clock_offset(ages: Sequence[float]) -> float:
     if min(len(low), len(high), turns) < _AGES // 4 or offset < _LEAST_OFFSET:
         return 0.0
     return offset if max(np.ptp(low), np.ptp(high)) < 0.25 * offset else 0.0
+
+
+def unused_group(stamps: Sequence[Stamp]) -> str:
+    """Which of two groups of stamps is of no use, in words; empty where both are used, or neither.
+
+    rclpy does not say who sent a message, so that the group is named by its stamps and, where it
+    has a frame of its own, by that.
+    """
+    ages = np.array([stamp.age for stamp in stamps])
+    late = ages > 0.5 * (ages.min() + ages.max())
+    groups = [[s for s, in_it in zip(stamps, late == side) if in_it] for side in (True, False)]
+    shares = [sum(stamp.used for stamp in group) / len(group) for group in groups]
+    if max(shares) < 0.5 or min(shares) >= 0.5:
+        return ''
+    lost = int(np.argmin(shares))
+    frames, others = ({stamp.frame_id for stamp in groups[k]} for k in (lost, 1 - lost))
+    named = f", of frame '{min(frames)}'," if frames.isdisjoint(others) else ''
+    count = sum(not stamp.used for stamp in groups[lost])
+    return (
+        f'the publisher of the {("older", "newer")[lost]} stamps{named} is not used ({count} of '
+        f'{len(groups[lost])} messages)'
+    )
 
 
 class Finding(NamedTuple):
@@ -321,11 +352,11 @@ class Reporter:
         warnings: Sequence[str] = (),
         lost: Mapping[str, int],
         incompatible: Mapping[str, str],
-        publishers: Callable[[str], int] = lambda topic: 1,
+        publishers: Callable[[str], Sequence[str]] = lambda topic: (),
     ) -> DiagnosticArray:
         """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds; max_age: see
-        `Ages.report`; starting: why no input is heard yet, or empty; publishers: how many there
-        are of a topic."""
+        `Ages.report`; starting: why no input is heard yet, or empty; publishers: the names of
+        those of a topic."""
         meter, before = self._meter, self._before
         totals = self._before = _Totals(
             now,
@@ -385,7 +416,7 @@ class Reporter:
         stale_after: float,
         lost: Mapping[str, int],
         incompatible: Mapping[str, str],
-        publishers: Callable[[str], int],
+        publishers: Callable[[str], Sequence[str]],
     ) -> DiagnosticStatus:
         meter, now, fresh, refused = self._meter, period.now, period.fresh, period.refused
         values: dict[str, Any] = {}
@@ -423,15 +454,17 @@ class Reporter:
         if incompatible:
             sentence = 'a peer has an incompatible quality of service'
             found.append(Finding('incompatible', WARN, sentence, timed=True))
-        for name, ages in meter.ages.items():
-            offset = clock_offset(ages)
-            if offset and publishers(topic := self._topics[name]) > 1:
+        for name, stamps in meter.stamps.items():
+            offset = clock_offset([stamp.age for stamp in stamps])
+            if offset and len(senders := publishers(topic := self._topics[name])) > 1:
                 values[f'{name} offset of stamps [s]'] = offset
                 # OK: what comes by way of a modem is as late as that, and stamped rightly.
                 sentence = (
                     f'stamps on {topic} are of two groups {offset:.1f} s apart: the clocks of its '
-                    'publishers disagree, or one is later'
+                    f'publishers {" and ".join(sorted(senders))} disagree, or one is later'
                 )
+                if unused := unused_group(stamps):
+                    sentence += f'; {unused}'
                 found.append(Finding(f'clocks {name}', OK, sentence, timed=True))
         if not period.stale:
             gone = self._gone(now, stale_after)

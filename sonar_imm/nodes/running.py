@@ -94,7 +94,18 @@ def _init(args: list[str] | None) -> None:
         mine = SignalHandlerOptions.NO if stopper.listening else None
         rclpy.init(args=args, signal_handler_options=mine)
     except RuntimeError as error:  # a parameter file or a ROS argument that rcl cannot parse
-        raise ConfigError(' '.join(str(error).split())) from None
+        raise ConfigError(start_trouble(error)) from None
+
+
+def start_trouble(error: RuntimeError) -> str:
+    """Why ROS does not start, in one sentence."""
+    text = ' '.join(str(error).split())
+    if 'initialize logging' in text:
+        return (
+            f'ROS cannot keep its log, as without a HOME that can be written to ({text}): set '
+            'ROS_LOG_DIR to a folder that can be written to'
+        )
+    return text
 
 
 def help_text(args: Sequence[str] | None) -> str | None:

@@ -31,7 +31,7 @@ from sonar_imm.parameters import (
     ParameterSpec,
     sections_of,
     small_text,
-    unknown_parameter,
+    unknown_parameters,
 )
 from sonar_imm.texts import visible
 from sonar_imm.trackers import System, SYSTEMS
@@ -204,13 +204,8 @@ def load_config(
     specs = {spec.name: spec for spec in node.specs()} | specs_with(tracker, values, overrides)
     values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
     others = _detector_specs(system)
-    unknown = [
-        unknown_parameter(name, specs)
-        for name in values
-        if name not in specs and name not in others
-    ]
-    if unknown:
-        raise ConfigError(*unknown)
+    if unknown := [name for name in values if name not in specs and name not in others]:
+        raise ConfigError(*unknown_parameters(unknown, specs))
     given = node.from_mapping(values, ignore_unknown=True)
     # Checked too, though a recording has its own.
     chosen_types(system.name, given.input_types)

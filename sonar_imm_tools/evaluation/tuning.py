@@ -478,7 +478,8 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
             high = rounded(tunable.value(min(place + 2.0 * se[k], bounds[k, 1])))
         reason = ''
         if at_bound[k]:
-            reason = f'the likelihood goes on rising beyond {tunable.value(best[k]):.4g}'
+            side = 'below' if best[k] - bounds[k, 0] < 0.05 else 'above'
+            reason = f'the likelihood goes on rising {side} {tunable.value(best[k]):.4g}'
         elif not sharp[k]:
             reason = 'the likelihood hardly depends on it'
         elif k not in kept:

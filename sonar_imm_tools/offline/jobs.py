@@ -159,6 +159,8 @@ def ignore_interrupt() -> None:
 def sentence_of(error: BaseException) -> str:
     """One line; what is not a mistake of the user keeps the name of its class."""
     text = ' '.join(str(error).split())
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        text = f'{error.filename}: {error.strerror}'
     expected = isinstance(error, (ConfigError, Rejection, BagError, OSError))
     return text if expected and text else f'{type(error).__name__}: {text}'
 

@@ -292,7 +292,10 @@ class OfflineRun:
         pings in which most obstacles moved alike, and messages refused before."""
         counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
         health = self.tracker.health()
-        kept = ('covariance_repairs', 'not_started', 'pings_moving_alike', 'waiting_for_vessel')
+        kept = (
+            *('covariance_repairs', 'not_started', 'names_without_track'),
+            *('pings_moving_alike', 'waiting_for_vessel'),
+        )
         for name in kept:
             if count := health.get(name):
                 counts[name] = int(count)
@@ -322,6 +325,12 @@ class OfflineRun:
         """The obstacles that are known at the end; nothing of a tracker that keeps none."""
         known = getattr(self.tracker, 'known', None)
         return {} if known is None else {'landmarks': known()}
+
+    def array(self) -> dict[str, Any]:
+        """What the echoes show of the staves of an array; nothing of other sensors, or of too few
+        pings."""
+        found: dict[str, Any] = getattr(self.tracker, 'array', dict)()
+        return {'array': found} if found else {}
 
     def mounting(self) -> dict[str, Any]:
         """Where /tf_static says that the sonar is on its vehicle; nothing where it does not."""
@@ -404,6 +413,7 @@ def write_run(
         **offline.target_names(),
         **offline.mounting(),
         **offline.landmarks(),
+        **offline.array(),
         timings={
             'wall_s': seconds,
             'mb_per_s': recipe['bag_bytes'] / seconds * 1e-6,

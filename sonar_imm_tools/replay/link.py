@@ -20,6 +20,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from sonar_imm.nodes.running import start_trouble
+
 MATCH_LIMIT = 15.0
 """Seconds to wait for peers. Discovery is usually instant but now and then takes three seconds."""
 _LOOK = 0.1
@@ -36,14 +38,18 @@ class Link:
     """
 
     def __init__(self, name: str, *, domain_id: int | None = None):
-        """Open a node called `name`; `domain_id` None means the one of the environment."""
+        """Open a node called `name`; `domain_id` None means the one of the environment. Raises
+        `LinkError` where ROS does not start."""
         self.context = Context()
-        rclpy.init(
-            args=[name],
-            context=self.context,
-            domain_id=domain_id,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
+        try:
+            rclpy.init(
+                args=[name],
+                context=self.context,
+                domain_id=domain_id,
+                signal_handler_options=SignalHandlerOptions.NO,
+            )
+        except RuntimeError as error:
+            raise LinkError(start_trouble(error)) from None
         self.node = Node(name, context=self.context, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)

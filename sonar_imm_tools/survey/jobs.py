@@ -19,6 +19,7 @@ import hashlib
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from attrs import asdict, evolve, frozen
@@ -32,6 +33,7 @@ from sonar_imm.files import whole
 from ..offline.run_folder import fingerprint, finite
 from ..recordings.export.points import read_points
 from ..recordings.sources import BagError
+from ..recordings.writer import naming
 from .grid import grid_of_looks, HALO, Soundings
 from .line import budget_of, joined_lines, Line, line_of, without_far
 from .looks import Looks, looks_of
@@ -258,8 +260,10 @@ def _table(columns: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def _save_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     path.with_suffix('.json').unlink(missing_ok=True)  # no signature beside what it is not of
-    with whole(path, follow=False) as unfinished, unfinished.open('wb') as file:
-        np.save(file, _table(columns))
+    with naming(path), whole(path, follow=False) as unfinished, unfinished.open('wb') as file:
+        # To a file itself numpy writes in a way that does not say why it failed.
+        stream: Any = SimpleNamespace(write=file.write)
+        np.save(stream, _table(columns))
 
 
 def _columns(line: Line) -> dict[str, np.ndarray]:

@@ -21,7 +21,7 @@ import pytest
 from scipy.stats import norm
 import yaml
 
-from sonar_imm.measurements import Detections, Fix, Navigation
+from sonar_imm.measurements import Detections, Fix, Navigation, NOBODY
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
@@ -66,24 +66,67 @@ def test_a_file_is_written_where_nothing_is_determined(
     assert main(['track', str(bag), str(tmp_path / 'run'), '--params', str(out)]) == 0
 
 
-@pytest.mark.parametrize('model_set', ['linear', 'families'])
-def test_covariances_a_thousand_times_too_small_are_found(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], model_set: str
-) -> None:
-    """The tracker rejects nearly all fixes; at ten times what is stated the likelihood is no
-    better than at one."""
-    table, bag = tmp_path / 'fixes.csv', tmp_path / 'fixes.bag'
+def wandering(folder: Path, variance: float, first: float = 1.0, second: float = 1.0) -> Path:
+    """A fix a second for a minute, of a target that moves as the set `linear` says; variance: what
+    messages state; first, second: the standard deviation of the errors of each half, m."""
     rng, lines = np.random.default_rng(1), ['stamp_s,x,y,std']
-    for second in range(60):
-        east, north = np.array([0.7 * second, 0.2 * second]) + rng.normal(0.0, 1.0, 2)
-        lines.append(f'{1_700_000_000 + second},{east:.4f},{north:.4f},{1e-3**0.5:.6f}')
-    table.write_text('\n'.join(lines) + '\n', encoding='utf-8')
-    assert main(['convert', 'fixes', str(table), str(bag)]) == 0
+    F, Q = np.array([[1.0, 1.0], [0.0, 1.0]]), 0.25**2 * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
+    state = np.array([[0.0, 0.0], [0.7, 0.2]])
+    for k, std in enumerate([first] * 30 + [second] * 30):
+        state = F @ state + rng.multivariate_normal(np.zeros(2), Q, 2).T
+        east, north = state[0] + rng.normal(0.0, std, 2)
+        lines.append(f'{1_700_000_000 + k},{east:.4f},{north:.4f},{variance**0.5:.6f}')
+    (folder / 'fixes.csv').write_text('\n'.join(lines) + '\n', encoding='utf-8')
+    assert main(['convert', 'fixes', str(folder / 'fixes.csv'), str(folder / 'fixes.bag')]) == 0
+    return folder / 'fixes.bag'
+
+
+@pytest.mark.parametrize(
+    ('model_set', 'factor'), [('families', 25), ('linear', 60), ('families', 1000)]
+)
+def test_covariances_that_are_far_too_small_are_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], model_set: str, factor: int
+) -> None:
+    """The tracker rejects nearly all fixes, or begins tracks that share them; at ten times what is
+    stated the likelihood is no better than at one."""
+    bag = wandering(tmp_path, 1.0 / factor)
     capsys.readouterr()
     options = ['--system', 'diver', '--set', f'model_set={model_set}', '--json']
     assert main(['tune', str(bag), *options, '--parameters', 'covariance_scale']) == 0
     (row,) = json.loads(capsys.readouterr().out)['parameters']
-    assert row['verdict'] == 'determined' and 600.0 < row['after'] < 1600.0
+    assert row['verdict'] == 'determined' and row['before'] == 1.0
+    assert row['low'] < factor < row['high'] < 3.0 * row['low']
+
+
+def test_a_sharp_fit_that_predicts_the_other_half_no_better_is_not_determined(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second half is three times as noisy as the first: between them lies a scale that is good
+    for neither."""
+    bag, out = wandering(tmp_path, 1.0, first=0.6, second=1.8), tmp_path / 'tuned.yaml'
+    capsys.readouterr()
+    assert main(['tune', str(bag), *QUICK, '--json', '--out', str(out)]) == 0
+    (row,) = json.loads(capsys.readouterr().out)['parameters']
+    assert 1.0 < row['low'] < row['high'] < 2.5 * row['low'] and row['held_out_gain'] < 0.0
+    assert row['verdict'] == 'not determined' and 'not fitted are predicted' in row['reason']
+    assert row['before'] == row['after'] == 1.0
+    written = yaml.safe_load(out.read_text())['/**']['ros__parameters']
+    assert written == {'model_set': 'linear', 'covariance_scale': 1.0}
+    assert main(['track', str(bag), str(tmp_path / 'run'), '--params', str(out)]) == 0
+
+
+def test_covariances_that_are_too_large_are_said_to_be_out_of_range(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Unless the fit may begin below: then they are found."""
+    bag = wandering(tmp_path, 25.0)
+    capsys.readouterr()
+    assert main(['tune', str(bag), *QUICK]) == 0
+    printed = capsys.readouterr().out
+    assert 'covariance_scale: not determined, the likelihood goes on rising below 1\n' in printed
+    assert main(['tune', str(bag), *QUICK, '--set', 'covariance_scale=0.01', '--json']) == 0
+    (row,) = json.loads(capsys.readouterr().out)['parameters']
+    assert row['verdict'] == 'determined' and row['low'] < 0.04 < row['high']
 
 
 @pytest.mark.parametrize(
@@ -315,6 +358,68 @@ def score_of(
         fix = Fix(stamp_ns=round(second * 1e9), position=position, covariance=covariance)
         tracker.process(fix)
     return math.fsum(value for value, _ in tracker.scores.values())
+
+
+class TwoTracks(dict[str, np.ndarray]):
+    """Two tracks of one diver."""
+
+    life = SimpleNamespace(track_id=np.array([1, 2]))
+
+
+def score_of_two(f: np.ndarray, is_complete: bool) -> tuple[float, Scored, float]:
+    """The score of fixes with densities f (2, D) under two tracks that exist with .9 and .4; the
+    tracker; and the density of other fixes."""
+    config = DiverConfig(clutter_density=2e-4)
+    tracker, D = Scored(config), f.shape[1]
+    tracker.area, tracker.existence = 500.0, {1: 0.9, 2: 0.4}
+    pairs = SimpleNamespace(track_log=np.log(f), direct=np.ones((2, D)), nis=np.zeros((2, D)))
+    known: Any = TwoTracks(existence=np.array([0.9, 0.4]), target_id=np.full(2, NOBODY))
+    group: Any = SimpleNamespace(
+        config=config,
+        association=SimpleNamespace(hit=np.ones(2, bool), fix=np.zeros(2, int)),
+        pairs=pairs,
+        new_targets=1e-5,
+        detection=None,
+        target_id=None,
+        is_complete=is_complete,
+    )
+    score, count = tracker._score(known, group)
+    assert count == D
+    return score, tracker, 2e-4 + 1e-5
+
+
+def test_a_fix_that_comes_singly_is_of_one_track() -> None:
+    """Two tracks that predict it well do not count it twice."""
+    score, _, other = score_of_two(np.array([[0.2], [0.1]]), is_complete=False)
+    p = DiverConfig().detection_probability
+    mixture = (0.9 * 0.2 + 0.4 * 0.1) / (0.9 + 0.4)
+    assert score == pytest.approx(math.log((1.0 - p) * other + p * mixture))
+
+
+def test_the_score_of_a_scan_is_that_of_all_joint_events() -> None:
+    f, r, p = (
+        np.array([[0.2, 0.003], [0.1, 0.05]]),
+        (0.9, 0.4),
+        DiverConfig().detection_probability,
+    )
+    score, tracker, other = score_of_two(f, is_complete=True)
+    events, exists = [], [[], []]
+    for one in (None, 0, 1):
+        for two in (None, 0, 1):
+            if one is None or one != two:
+                parts = [
+                    1.0 - r[t] * p if d is None else r[t] * p * f[t, d] / other
+                    for t, d in enumerate((one, two))
+                ]
+                events.append(math.prod(parts))
+                for t, d in enumerate((one, two)):
+                    alive = r[t] * (1.0 - p) / (1.0 - r[t] * p) if d is None else 1.0
+                    exists[t].append(events[-1] * alive)
+    total = sum(events)
+    assert score == pytest.approx(2 * math.log(other) - 500.0 * other + math.log(total))
+    assert tracker.existence == pytest.approx(
+        {1: sum(exists[0]) / total, 2: sum(exists[1]) / total}
+    )
 
 
 def test_the_score_is_that_of_the_reference_vectors() -> None:

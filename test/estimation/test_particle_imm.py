@@ -16,7 +16,7 @@ import sys
 import numpy as np
 import pytest
 
-from sonar_imm import cv, IMM, ParticleIMM, position
+from sonar_imm import ct, cv, IMM, ParticleIMM, position
 from sonar_imm.estimation import kalman
 from sonar_imm.estimation.markov import RateChain
 
@@ -421,3 +421,53 @@ def test_the_filters_need_no_compiler():
         'assert "numba" not in sys.modules'
     )
     subprocess.run([sys.executable, '-c', code], check=True)
+
+
+# -- the verbs of IMM -----------------------------------------------------------------------------
+
+
+def test_steps_to_stamps_are_steps_of_their_differences():
+    models = {'a': walk(0.3), 'b': walk(2.0, drift=1.0)}
+
+    def filter_(**start):
+        particles = np.random.default_rng(1).normal(size=(200, 1))
+        rng = np.random.default_rng(2)
+        return ParticleIMM(models, TWO, particles, normal(0.5), rng, **start)
+
+    by_stamp, by_dt = filter_(stamp=100.0), filter_()
+    for z, dt in ((0.2, 0.5), (None, 2.0), (1.0, 0.0), (1.4, 1.25)):
+        assert by_stamp.step(z, stamp=by_stamp.stamp + dt) == by_dt.step(z, dt) == 'used'
+    assert (by_stamp.stamp, by_dt.stamp) == (103.75, 3.75)
+    assert by_stamp.particles.tobytes() == by_dt.particles.tobytes()
+    assert by_stamp.step(9.0, stamp=103.0) == 'too_late'
+    assert by_stamp.particles.tobytes() == by_dt.particles.tobytes()
+    with pytest.raises(ValueError, match='not both'):
+        by_dt.step(0.0, 1.0, stamp=5.0)
+    with pytest.raises(ValueError, match='finite'):
+        by_dt.step(0.0, stamp=math.nan)
+    first = filter_()
+    first.step(0.2, stamp=50.0)  # the first stamp is that of the start
+    none = filter_(stamp=50.0)
+    none.step(0.2, 0.0)
+    assert first.particles.tobytes() == none.particles.tobytes() and first.stamp == 50.0
+
+
+def test_both_filters_have_the_same_verbs():
+    models, start = [cv(noise=0.1), ct(noise=0.1, turn_rate=0.2)], np.zeros(4)
+    gaussian = IMM(models, TWO, start, np.eye(4), position(std=1.0))
+    particles = ParticleIMM(
+        {'a': still, 'b': still}, TWO, np.zeros((9, 1)), normal(1.0), np.random.default_rng(1)
+    )
+    verbs = ('step', 'estimate', 'model_probabilities', 'log_likelihood', 'stamp', 'names')
+    for each in (gaussian, particles):
+        assert all(hasattr(each, verb) for verb in verbs)
+    assert gaussian.step(None) == particles.step(None) == 'used'
+    assert gaussian.stamp == particles.stamp == 1.0
+
+
+def test_the_package_shows_its_names_before_they_are_imported():
+    program = 'import sys, sonar_imm; print(dir(sonar_imm)); print("numpy" in sys.modules)'
+    shown = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    names, loaded = shown.stdout.splitlines()
+    assert "'IMM'" in names and "'ParticleIMM'" in names and 'import_module' not in names
+    assert loaded == 'False'

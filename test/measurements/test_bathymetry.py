@@ -57,6 +57,9 @@ def test_what_is_fine_is_kept_as_it_came_and_read_only():
         ('nan', {'range': np.append(np.arange(19.0), np.nan)}),
         ('nan', {'iq': np.full((20, 4), np.nan)}),
         ('silent', {'iq': np.zeros((20, 4))}),
+        ('out_of_range', {'iq': np.full((20, 4), 1e-150)}),
+        ('out_of_range', {'iq': np.full((20, 4), 5e-324)}),
+        ('out_of_range', {'iq': np.full((20, 4), 1e200)}),
         ('out_of_range', {'sound_speed': 15.0}),
         ('out_of_range', {'frequency': 455.0}),
         ('out_of_range', {'element_spacing': -0.1}),
@@ -68,6 +71,17 @@ def test_what_cannot_be_used_is_refused_with_its_reason(reason, changes):
     with pytest.raises(Rejection) as caught:
         snapshot(**changes)
     assert caught.value.reason == reason and caught.value.sentence
+
+
+@pytest.mark.parametrize('value', [5e-324, 1e-200, 1e200, np.inf, 0.0, -1.0])
+def test_a_variance_that_is_none_is_not_known(value):
+    assert snapshot(noise_variance=np.full(20, value)).noise_variance is None
+
+
+def test_bins_of_another_size_are_left_out():
+    iq = np.ones((20, 4), complex)
+    iq[3], iq[4] = 1e-200, 1e200
+    assert (~snapshot(iq=iq).usable).nonzero()[0].tolist() == [3, 4]
 
 
 def test_a_storm_of_bins_is_refused():

@@ -152,8 +152,6 @@ def test_a_height_that_is_not_stated_or_cannot_be_true_is_left_out_alone(message
     [
         (pose(block(4.0, 1.0, 2.0, 9.0)), 'bad_covariance'),
         (pose(block(1.0, 2.0, 2.0, 1.0)), 'bad_covariance'),
-        (pose(block(math.nan, 0.0, 0.0, 1.0)), 'nan'),
-        (pose(block(1.0, math.inf, math.inf, 1.0)), 'nan'),
         (pose(block(1e-300, 0.0, 0.0, 1e-300)), 'out_of_range'),
         (pose(block(1e300, 0.0, 0.0, 1e308)), 'out_of_range'),
         (pose(x=math.nan), 'nan'),
@@ -167,6 +165,16 @@ def test_a_height_that_is_not_stated_or_cannot_be_true_is_left_out_alone(message
 )
 def test_what_cannot_be_used_is_refused_with_its_reason(message, code):
     assert reason(message) == code
+
+
+@pytest.mark.parametrize(
+    'flat',
+    [(math.nan, 0.0, 0.0, 1.0), (1.0, math.inf, math.inf, 1.0), (-1.0, 0.0, 0.0, 1.0), (0.0,) * 4],
+)
+def test_a_covariance_that_is_not_stated_is_unknown_and_the_position_used(flat):
+    """As in navigation and in NavSatFix."""
+    fix = read_fix(pose(block(*flat)))
+    assert fix.covariance is None and fix.position[0] == read_fix(pose()).position[0]
 
 
 def test_a_covariance_of_another_size_is_refused():
@@ -442,7 +450,7 @@ def test_north_east_down_is_turned():
         ({'x': 2e8}, 'out_of_range'),
         ({'covariance': np.zeros((2, 2))}, 'no_covariance'),
         ({'covariance': [[-1.0, 0.0], [0.0, -1.0]]}, 'no_covariance'),
-        ({'covariance': [[math.nan, 0.0], [0.0, 1.0]]}, 'nan'),
+        ({'covariance': [[math.nan, 0.0], [0.0, 1.0]]}, 'no_covariance'),
         ({'covariance': [[1.0, 2.0], [2.0, 1.0]]}, 'bad_covariance'),
         ({'covariance': [[1.0, 0.5], [0.0, 1.0]]}, 'bad_covariance'),
         ({'covariance': np.eye(2) * 1e-20}, 'out_of_range'),

@@ -20,7 +20,7 @@ from rclpy.qos import DurabilityPolicy
 
 from msg_adapters.inputs import inputs_of, needed
 from sonar_imm.nodes.base import TrackerNode
-from sonar_imm.nodes.diagnostics import clock_offset, Meter, Reporter, summary
+from sonar_imm.nodes.diagnostics import clock_offset, Meter, Reporter, Stamp, summary
 from sonar_imm.nodes.messages import message_class
 from sonar_imm.nodes.qos import latched_qos, output_qos
 
@@ -488,18 +488,40 @@ def two_clocks(rng, offset=3.0, share=0.5, jitter=0.05, count=40):
     return -1.7e9 + offset * (rng.random(count) < share) + jitter * rng.random(count)
 
 
+def two_publishers(desk, used=(True, True), frames=('map', 'map')):
+    """Two publishers, the stamps of the second one are three seconds older."""
+    for k, age in enumerate(two_clocks(np.random.default_rng(1))):
+        second = bool(age > -1.7e9 + 1.5)
+        desk.meter.arrived('fix', 0.1 * k)
+        desk.meter.stamped('fix', Stamp(age, frames[second], used[second]))
+    desk.report(4.0, publishers={'/usbl/fix': ['/rov/usbl', '/ship/usbl']}.get)
+    assert desk.input.level == DiagnosticStatus.OK
+    return desk.input.message
+
+
 def test_two_publishers_whose_clocks_disagree_are_said(desk):
     """Messages of either are used; only a person can know which one is right."""
-    rng = np.random.default_rng(1)
-    for k, age in enumerate(two_clocks(rng)):
-        desk.meter.arrived('fix', 0.1 * k)
-        desk.meter.stamped('fix', age)
-    desk.report(4.0, publishers={'/usbl/fix': 2}.get)
-    assert desk.input.level == DiagnosticStatus.OK
-    assert 'stamps on /usbl/fix are of two groups 3.0 s apart' in desk.input.message
+    assert two_publishers(desk) == (
+        'stamps on /usbl/fix are of two groups 3.0 s apart: the clocks of its publishers '
+        '/rov/usbl and /ship/usbl disagree, or one is later'
+    )
     assert float(desk.values['fix offset of stamps [s]']) == pytest.approx(3.0, abs=0.05)
-    desk.report(4.1, publishers={'/usbl/fix': 1}.get)  # of one publisher it is the way they take
+    desk.report(4.1, publishers={'/usbl/fix': ['/usbl']}.get)  # of one it is the way they take
     assert 'fix offset of stamps [s]' not in desk.values
+
+
+@pytest.mark.parametrize(
+    'used, frames, which',
+    [
+        ((True, False), ('map', 'map'), 'of the older stamps is not used (20 of 20 messages)'),
+        ((False, True), ('map', 'map'), 'of the newer stamps is not used (20 of 20 messages)'),
+        ((True, False), ('a', 'b'), "of the older stamps, of frame 'b', is not used (20 of 20"),
+        ((False, False), ('a', 'b'), ''),
+    ],
+)
+def test_which_of_two_publishers_is_not_used_is_said(desk, used, frames, which):
+    said = two_publishers(desk, used, frames)
+    assert f'; the publisher {which}' in said if which else 'not used' not in said
 
 
 def test_stamps_of_one_clock_are_no_two(desk):
@@ -536,5 +558,7 @@ def test_a_node_with_two_publishers_whose_clocks_disagree_says_so(make_bench, wa
             break
     else:
         pytest.fail(received[-1].status[0].message)
+    name = f'/{rig.bench.peer.get_name()}'
+    assert f'of its publishers {name} and {name} disagree' in received[-1].status[0].message
     rig.bench.peer.destroy_publisher(other)
     rig.bench.spin_until(lambda: 'apart' not in received[-1].status[0].message)

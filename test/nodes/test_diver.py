@@ -9,6 +9,7 @@
 """The diver node's displays: odometry of every confirmed diver, probabilities of one."""
 
 import math
+import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -33,7 +34,7 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix, Fixes, GeodeticFix, RelativeFix, Start, VesselPose
 from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.messages import make, message_class
-from sonar_imm.nodes.qos import lockstep_qos
+from sonar_imm.nodes.qos import lockstep_qos, output_qos
 from sonar_imm.parameters import ConfigError
 
 
@@ -90,6 +91,43 @@ def test_nothing_is_shown_of_tentative_tracks_and_of_none(rig):
     node.show([an_estimate([1], [1])])
     bench.spin_until(lambda: odometry and probabilities)
     assert len(odometry) == len(probabilities) == 1
+
+
+def test_a_message_that_the_tracker_cannot_use_is_known_as_such(rig):
+    """Of two publishers, the one with a clock half a minute behind is of no use."""
+    node = rig[1]
+    for second in range(100, 110):
+        for behind in (0, 30):
+            values = {'stamp_ns': (second - behind) * 10**9, 'frame_id': 'map'}
+            fix = Fix(position=(1.0, second + behind, 0.0), covariance=np.eye(2), **values)
+            node.receive('fix', write_fix(fix, make))
+    assert [stamp.used for stamp in node._meter.stamps['fix']] == [True, False] * 10
+    assert {stamp.frame_id for stamp in node._meter.stamps['fix']} == {'map'}
+
+
+@pytest.mark.usefixtures('quick')
+@pytest.mark.parametrize(
+    'waited, behind, used',
+    [(3.0, 0, False), (1.0, 0, True), (0.0, 20, True), (0.0, 3600, True), (0.0, -3600, True)],
+)
+def test_what_waited_in_the_node_is_dropped_and_what_is_late_is_not(rig, waited, behind, used):
+    """Behind a busy tracker, from a slow sensor, and from a clock that is off."""
+    bench, node, *_ = rig
+    received = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    for k in range(12):
+        now_ns = time.time_ns()
+        stamp_ns = now_ns - round((waited + behind) * 1e9) + k
+        fix = Fix(stamp_ns=stamp_ns, position=(k, 0.0, 0.0), covariance=np.eye(2), frame_id='map')
+        info = {'received_timestamp': now_ns - round(waited * 1e9)}
+        node.receive('fix', write_fix(fix, make), info)
+    assert node._meter.dropped == ({} if used else {'fix': 12})
+    assert node.tracker.counts['used'] == (12 if used else 0)
+    bench.spin_until(lambda: len(received) > 3)
+    input_part, tracker = received[-1].status
+    said = f'{input_part.message}; {tracker.message}'
+    assert ('12 messages dropped' in said) == (not used)
+    assert ('arrive that late' in said) == (behind == 20)
+    assert ('the clock of this computer' in said) == (abs(behind) == 3600)
 
 
 def test_a_diver_is_tracked_from_fixes(rig):

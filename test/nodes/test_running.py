@@ -8,6 +8,7 @@
 
 """The executor of the nodes: what it leaves for later still comes."""
 
+import os
 import subprocess
 import sys
 import time
@@ -19,6 +20,7 @@ from std_msgs.msg import Empty
 
 from sonar_imm.nodes.qos import Endpoints, lockstep_qos, output_qos
 from sonar_imm.nodes.running import EVENT_PERIOD, MessagesFirst
+from sonar_imm_tools.replay.link import Link
 
 
 def test_messages_come_at_once_and_events_within_their_period(make_bench):
@@ -90,3 +92,34 @@ def test_a_process_that_was_told_to_stop_does_not_take_its_modules_down(asked):
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 3 and done.stdout.startswith('said\n') and not done.stderr
     assert ('taken down' in done.stdout) != asked
+
+
+START = """
+import sys
+from rclpy.node import Node
+from sonar_imm.nodes.running import run
+sys.argv = ['diver_node']
+sys.exit(run(lambda: Node('walker')))
+"""
+
+
+@pytest.mark.parametrize(
+    'folders', [{}, {'HOME': '/dev/null'}, {'ROS_LOG_DIR': '/dev/null/log'}], ids=str
+)
+def test_without_a_folder_for_its_log_a_node_says_what_to_set(folders):
+    usual = {k: v for k, v in os.environ.items() if k not in ('HOME', 'ROS_LOG_DIR', 'ROS_HOME')}
+    done = subprocess.run(
+        [sys.executable, '-c', START], env={**usual, **folders}, capture_output=True, text=True
+    )
+    assert done.returncode == 2 and 'Traceback' not in done.stderr
+    said = done.stderr.splitlines()[-1]
+    assert said.startswith('diver_node: ROS cannot keep its log')
+    assert said.endswith('set ROS_LOG_DIR to a folder that can be written to')
+
+
+def test_a_link_without_a_folder_for_its_log_says_the_same(monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', '/dev/null/log')
+    # Logging is initialized once for all contexts of a process.
+    words = f'from {Link.__module__} import Link; Link("peer")'
+    done = subprocess.run([sys.executable, '-c', words], capture_output=True, text=True)
+    assert 'LinkError: ROS cannot keep its log' in done.stderr

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.cli import main
 from sonar_imm_tools.offline.tracking import final_estimates, InputOptions, OfflineRun, Revisions
 from sonar_imm_tools.recordings.convert import convert_fixes
 from sonar_imm_tools.recordings.reader import BagError, BagReader
@@ -206,3 +207,25 @@ def test_fixes_that_scatter_five_times_too_far_are_named_before_the_fiftieth(tmp
     # Over 20 runs .80.
     assert inside > 0.7
     assert any('as large as reported' in text for text in early)
+
+
+def test_pings_that_are_shared_out_over_processes_give_the_same_estimates(tmp_path, monkeypatch):
+    bag = str(tmp_path / 'bag')
+    small = ('pings=3', 'last_range=30', 'bin_width=0.1')
+    scene = ['simulate', 'bathymetry', bag, '--scenario', 'moving_two_sides']
+    assert main([*scene, *(word for each in small for word in ('--set', each))]) == 0
+    system = SYSTEMS['bathymetry']
+    made = []
+    for jobs in (1, 2):
+        with BagReader(bag) as reader:
+            options = InputOptions(jobs=jobs)
+            offline = OfflineRun(reader, system, system.config_type()(), options)
+            if jobs > 1:  # nothing is done here
+                monkeypatch.setattr(offline, '_in_turn', None)
+            made.append(list(offline.estimates()))
+            assert len(made[-1]) == 6 and offline.outcomes()['used'] == 6
+            assert len(offline.durations) >= 6 and min(offline.durations) > 0.0
+    for alone, shared in zip(*made, strict=True):
+        assert (alone.stamp_ns, alone.source) == (shared.stamp_ns, shared.source)
+        np.testing.assert_array_equal(alone.state, shared.state)
+        np.testing.assert_array_equal(alone.probabilities, shared.probabilities)

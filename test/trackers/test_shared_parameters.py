@@ -23,6 +23,7 @@ from sonar_imm.trackers.model_checks import chain_problems, matrix_problems
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm.trackers.shared_parameters import (
     DetectionParameters,
+    OriginParameters,
     StampParameters,
     StreamParameters,
     TrackLifeParameters,
@@ -177,3 +178,25 @@ def test_the_fathometer_believes_a_restarted_clock_after_so_many_records():
     assert used() == (5, 0)
     assert used(max_gap=60.0) == (5, 1)
     assert used(max_gap=60.0, restart_after=10) == (1, 0)
+
+
+ORIGIN_ENDS = (90.0, 360.0, 12000.0)
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+@pytest.mark.parametrize('place, name', [(0, 'latitude'), (1, 'longitude'), (2, 'height')])
+def test_the_end_of_a_range_belongs_to_it(place, name, sign):
+    origin = [1.0, 2.0, 3.0]
+    origin[place] = sign * ORIGIN_ENDS[place]
+    assert OriginParameters.from_mapping({'origin': origin}).origin == tuple(origin)
+    origin[place] = sign * (ORIGIN_ENDS[place] + 0.1)
+    with pytest.raises(ConfigError, match=f'origin: {name} must be between') as caught:
+        OriginParameters.from_mapping({'origin': origin})
+    assert len(caught.value.problems) == 1
+
+
+@pytest.mark.parametrize(
+    'origin, stated', [((0.0, 0.0, 5.0), False), ((0.0, 1.0, 0.0), True), ((1.0, 0.0, 0.0), True)]
+)
+def test_an_origin_on_the_equator_is_one(origin, stated):
+    assert bool(OriginParameters(origin=origin).stated_origin()) == stated

@@ -130,8 +130,14 @@ class BathymetryConfig(MountingParameters):
     element_spacing_wavelengths: float = live(0.0, '',
         'distance between staves in wavelengths; 0: as the snapshot says, else 0.5',
         range=(0.0, 100.0))
+    calibrate_array: bool = live(True, '',
+        'measure gain, phase and noise of the staves from the echoes of each ping, from four '
+        'staves on, not with multipath; dead and inverted staves are found, and named')
     conjugate: bool = live(False, '',
         'true when the phase of an echo from below broadside falls from stave to stave')
+    conjugate_auto: bool = live(True, '',
+        'turn conjugate round where the first pings fit a floor far better so; tilt_deg of 15 to '
+        '60 only, at other tilts a floor cannot tell')
     sound_speed: float = live(1500.0, 'm/s',
         'speed of sound for snapshots that hold times and state no sound speed',
         range=(1300.0, 1700.0))

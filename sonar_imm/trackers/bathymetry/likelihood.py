@@ -38,6 +38,7 @@ from ...acoustics import (
 )
 from ...acoustics import geometry as frames
 from ...acoustics.array import across_track, angle_of_depth, depth_of_angle, multipath_sines
+from ...acoustics.calibration import calibrate, Calibration
 from ...acoustics.geometry import Pose
 from ...acoustics.sounding import ErrorBudget, GeometryDoubt, Looks
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
@@ -304,20 +305,24 @@ class BinLikelihood(NamedTuple):
 
 
 def ping_likelihood(
-    snapshot: Snapshot, config: BathymetryConfig, swath: Swath, floor_below: float
+    snapshot: Snapshot,
+    config: BathymetryConfig,
+    swath: Swath,
+    floor_below: float,
+    staves: Calibration,
 ) -> BinLikelihood:
     """The likelihood of every bin of a snapshot under `config`. floor_below: how far below the
-    array the floor is said to be, m."""
+    array the floor is said to be, m; staves: what was done to those of the snapshot."""
     ranges, spacing = swath.ranges, swath.geometry.spacing
     iq = np.where(snapshot.usable[:, None], snapshot.iq, 0.0)
     first = 0
     if config.sonar_height_std > 0.0:
-        first = _first_return(snapshot, iq, abs(spacing), config)
+        first = _first_return(snapshot, iq, abs(spacing), config, staves)
         floor_below = float(ranges[first])
-    noise, known = _noise(snapshot, ranges, config, floor_below)
+    noise, known = _noise(snapshot, ranges, config, floor_below, staves)
     make = _beside_surface if config.multipath else _in_white_noise
-    parts = make(snapshot, iq, swath, floor_below, noise, config)
-    P = snapshot.staves
+    parts = make(snapshot, iq, swath, floor_below, noise, config, staves)
+    P = staves.count
     laplacian = config.likelihood == 'laplace'
     constant = laplace.log_constant if laplacian else laplace.gaussian_log_constant
     echo = _echoes(snapshot.usable, parts, known, P, abs(spacing), config)
@@ -340,16 +345,20 @@ def ping_likelihood(
 
 
 def _first_return(
-    snapshot: Snapshot, iq: ComplexArray, spacing: float, config: BathymetryConfig
+    snapshot: Snapshot,
+    iq: ComplexArray,
+    spacing: float,
+    config: BathymetryConfig,
+    staves: Calibration,
 ) -> int:
     """The first bin with an echo of the floor. Few staves need a stated noise to tell it from one
     bin."""
-    P, false_alarm = snapshot.staves, config.gate_false_alarm
-    noise = stated_noise(snapshot, config)
+    P, false_alarm = staves.count, config.gate_false_alarm
+    noise = stated_noise(snapshot, config) * staves.level
     if P < coherence.FEWEST_STAVES_ALONE and np.isfinite(noise).all():
-        ratio = variances.mean_power(iq) / noise
+        ratio = staves.power(iq) / noise
         return coherence.first_of(_loud(ratio, P, false_alarm, snapshot.usable))
-    gamma = coherence.coherence(iq, spacing)[0]
+    gamma = coherence.coherence(iq, spacing, weights=staves.weights)[0]
     return coherence.first_return(gamma, P, spacing=spacing, false_alarm=false_alarm)
 
 
@@ -385,21 +394,23 @@ def _in_white_noise(
     floor_below: float,
     noise: FloatArray,
     config: BathymetryConfig,
+    staves: Calibration,
 ) -> _Parts:
-    T, P = iq.shape
-    spacing = swath.geometry.spacing
-    above_noise = variances.mean_power(iq) / noise
-    signal, noise = _split(_signal(snapshot, noise, np.ones(T)), noise, config)
+    T, P = len(iq), staves.count
+    spacing, weights = swath.geometry.spacing, staves.weights
+    power = staves.power(iq)
+    above_noise = power / noise
+    signal, noise = _split(_signal(snapshot, power, noise, np.ones(T)), noise, config)
     gamma, sine = np.ones(T), np.full(T, np.nan)
     if config.shadow_gate or config.is_terrain:
-        gamma, sine = coherence.coherence(iq, abs(spacing))
+        gamma, sine = coherence.coherence(iq, abs(spacing), weights=weights)
     return _Parts(
-        form=laplace.form_coefficients(iq, signal, noise),
+        form=laplace.form_coefficients(iq, signal, noise, weights),
         base=np.zeros(T),
         spread=np.empty((T, 0), np.complex128),
         signal=signal,
         noise=noise,
-        log_determinant=P * np.log(noise) + np.log1p(P * signal / noise),
+        log_determinant=P * np.log(noise) + np.log1p(P * signal / noise) + staves.log_volume,
         coherence=gamma,
         sine=sine,
         loudness=above_noise,
@@ -413,13 +424,15 @@ def _beside_surface(
     floor_below: float,
     noise: FloatArray,
     config: BathymetryConfig,
+    staves: Calibration,
 ) -> _Parts:
     """With echoes by way of the surface as noise from where a flat floor would send them."""
     T, P = iq.shape
     level = 10.0 ** (0.1 * config.multipath_level_db)
     spacing = swath.geometry.spacing
     sines = swath.surface_sines(floor_below, config.sonar_depth)
-    signal = _signal(snapshot, noise, 1.0 + level * np.isfinite(sines).sum(axis=1))
+    echoes = 1.0 + level * np.isfinite(sines).sum(axis=1)
+    signal = _signal(snapshot, staves.power(iq), noise, echoes)
     signal, noise = _split(signal, noise, config)
     noise = np.maximum(noise, LEAST_NOISE * level * signal)
     step = 2.0 * math.pi * spacing
@@ -478,26 +491,41 @@ def _split(
     return (signal * (1.0 - share), noise + share * signal) if share > 0.0 else (signal, noise)
 
 
+def measure_staves(snapshot: Snapshot, config: BathymetryConfig, swath: Swath) -> Calibration:
+    """What the staves of a snapshot are, by its echoes; exact where they are not to be measured.
+    Echoes by way of the surface leave no bin with one wave."""
+    if not config.calibrate_array or config.multipath:
+        return Calibration.exact(snapshot.staves)
+    noise = stated_noise(snapshot, config)
+    known = noise if np.isfinite(noise).all() else None
+    return calibrate(snapshot.iq, snapshot.usable, abs(swath.geometry.spacing), known)
+
+
 def _noise(
-    snapshot: Snapshot, ranges: FloatArray, config: BathymetryConfig, floor_below: float
+    snapshot: Snapshot,
+    ranges: FloatArray,
+    config: BathymetryConfig,
+    floor_below: float,
+    staves: Calibration,
 ) -> tuple[FloatArray, BoolArray]:
     """Noise variance (T,) at a stave, and where it is known (T,): from the snapshot, the config or
     the water column; else it is taken blindly from what is not coherent."""
-    stated = stated_noise(snapshot, config)
+    stated = stated_noise(snapshot, config) * staves.level
     missing = np.isnan(stated)
     if not missing.any():
         return stated, ~missing
     quiet = (ranges < WATER_COLUMN * floor_below) & snapshot.usable
-    measured = bool(quiet.sum() >= FEWEST_QUIET_BINS)
+    measured, iq = bool(quiet.sum() >= FEWEST_QUIET_BINS), staves.heard(snapshot.iq)
     if measured:
-        quiet = variances.quiet_stretches(snapshot.iq, quiet)
-        level = variances.noise_variance(snapshot.iq, quiet)
+        quiet = variances.quiet_stretches(iq, quiet)
+        level = variances.noise_variance(iq, quiet)
     else:
-        level = variances.blind_noise_variance(snapshot.iq)
+        level = variances.blind_noise_variance(iq)
     if not level > 0.0:
         # Too few bins to tell noise from echo: suppose the 20 dB of a usual swath.
-        level = 0.01 * float(np.mean(variances.mean_power(snapshot.iq[snapshot.usable])))
+        level = 0.01 * float(np.mean(variances.mean_power(iq[snapshot.usable])))
         measured = False
+    level *= staves.level / staves.mean_noise
     return np.where(missing, level, stated), ~missing | measured
 
 
@@ -510,13 +538,15 @@ def stated_noise(snapshot: Snapshot, config: BathymetryConfig) -> FloatArray:
     return np.where(np.isfinite(given), given, level)
 
 
-def _signal(snapshot: Snapshot, noise: FloatArray, echoes: FloatArray) -> FloatArray:
-    """Signal variance (T,) at a stave: from the snapshot, else a moving mean of the power, of
+def _signal(
+    snapshot: Snapshot, power: FloatArray, noise: FloatArray, echoes: FloatArray
+) -> FloatArray:
+    """Signal variance (T,) at a stave: from the snapshot, else a moving mean of the power (T,), of
     which the floor has one part in `echoes` (T,)."""
     given = snapshot.signal_variance
     if given is not None and np.isfinite(given).all():
         return np.array(given)
-    power = np.where(snapshot.usable, variances.mean_power(snapshot.iq), 0.0)
+    power = np.where(snapshot.usable, power, 0.0)
     signal = variances.signal_variance(power, noise, usable=snapshot.usable) / echoes
     signal = np.fmax(signal, variances.LEAST_SNR * noise)
     return signal if given is None else np.where(np.isfinite(given), given, signal)

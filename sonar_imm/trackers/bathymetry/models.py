@@ -123,6 +123,13 @@ class TerrainModels:
     scatter: Scatter | None = None
     terrain: Terrain | None = None
 
+    @property
+    def least_variance(self) -> FloatArray:
+        """Variance (T,) of the first state that particles cannot do without: of half the noise of
+        the model with the least."""
+        each = np.square(self.scale) * np.square(self.G[:, 0]).sum(axis=1)
+        return np.asarray(0.25 * each.min(axis=1))
+
     def draw(self, particles: int, rng: np.random.Generator) -> FloatArray:
         """Particles (M, n, N) of the state before the first bin.
 

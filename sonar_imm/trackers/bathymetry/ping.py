@@ -27,10 +27,12 @@ from attrs import evolve, frozen
 import numpy as np
 
 from ...acoustics import variances
+from ...acoustics.calibration import Calibration
 from ...acoustics.coherence import common_mode, FEWEST_STAVES_ALONE
 from ...acoustics.geometry import Pose
 from ...acoustics.layover import GATE, Layover, layover
 from ...acoustics.rays import profile_of
+from ...acoustics.sounding import GeometryDoubt
 from ...estimates import Estimate, places
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.smoothing import smooth_modes
@@ -38,6 +40,7 @@ from ...measurements import Snapshot
 from ...soundings import SIDES
 from .config import BathymetryConfig
 from .filter_kernels import filter_block, normals
+from .findings import LoudBins, residual_ratio
 from .grid_kernels import (
     filter_ping,
     filter_scatter,
@@ -52,6 +55,7 @@ from .grid_kernels import (
 from .likelihood import (
     Floor,
     level_swath,
+    measure_staves,
     ping_likelihood,
     ship_swath,
     spacing_of,
@@ -71,8 +75,10 @@ DETECTABLE = 1.5
 
 LOUD = 4.0
 """So many times the noise is much power, in a bin of which two waves leave only noise."""
-FEWEST_BINS = 100
-"""Of fewer bins `residual_ratio` says nothing."""
+LEAST_STD = 0.02
+"""Of a state by particles, in the standard deviation of one snapshot."""
+JUST_GATED = 0.4
+"""Probability of a second surface where one cannot be measured: no sounding, and not two."""
 # Random numbers are drawn for so many at a time, which still fit into the cache.
 _BLOCK = 32768
 
@@ -97,12 +103,14 @@ class Ping:
 
 @frozen(eq=False)
 class Look:
-    """What a ping says before any terrain model is run along it; loud (T,): bins 20 dB above the
-    noise; loudest (T,): direction sine from which each bin is; layover: None where it is ignored;
-    floor_below: how far below the array the floor is said to be, m; alike:
-    `variances.bins_alike`."""
+    """What a ping says before any terrain model is run along it; staves: what they are, which
+    `snapshot` is without; loud (T,): bins 20 dB above the noise; loudest (T,): direction sine from
+    which each bin is; layover: None where it is ignored; floor_below: how far below the array the
+    floor is said to be, m; alike: `variances.bins_alike`."""
 
     ping: Ping
+    staves: Calibration
+    snapshot: Snapshot
     swath: Swath
     models: TerrainModels
     likelihood: PingLikelihood
@@ -116,34 +124,23 @@ class Look:
     def config(self) -> BathymetryConfig:
         return self.ping.config
 
-
-class LoudBins(NamedTuple):
-    """How many bins stand 20 dB above the noise, how many of them are passed over, and the share
-    of their power that differs from stave to stave, NaN without any; `layover.array_error`, NaN
-    where layover is ignored; how many bins from the depth of the floor on are usable, and how many
-    of these are passed over; `coherence.common_mode`; whether there were too few staves for the
-    two surfaces of a bin; `variances.bins_alike`."""
-
-    bins: int
-    silent: int
-    decorrelation: float
-    array_error: float = math.nan
-    beyond: int = 0
-    beyond_silent: int = 0
-    common_mode: float = 0.0
-    unresolved: bool = False
-    alike: float = 1.0
+    @property
+    def doubt(self) -> GeometryDoubt:
+        """What all pings have in common, with the line that phases of staves leave."""
+        doubt = self.config.doubt(self.snapshot.sound_speed)
+        return evolve(doubt, sine=self.staves.sine_std)
 
 
 class Answer(NamedTuple):
     """The estimate of one ping, what to count of it, numbers for diagnostics, what its loud bins
-    show, and its `residual_ratio`, NaN where no noise is stated."""
+    show, its `residual_ratio`, NaN where no noise is stated, and what its staves are."""
 
     estimate: Estimate
     counts: Counter[str]
     health: dict[str, float]
     loud: LoudBins
     residual: float
+    staves: Calibration
 
 
 def track_ping(ping: Ping) -> Answer:
@@ -156,26 +153,40 @@ def look(ping: Ping) -> Look:
     """The likelihood of each bin, and the models for it."""
     config = ping.config
     swath, floor_below = _swath(ping)
-    likelihood, loud, loudest = ping_likelihood(ping.snapshot, config, swath, floor_below)
+    staves, snapshot = measure_staves(ping.snapshot, config, swath), ping.snapshot
+    if not staves.is_exact:
+        snapshot = evolve(snapshot, iq=staves.apply(snapshot.iq))
+    likelihood, loud, loudest = ping_likelihood(snapshot, config, swath, floor_below, staves)
     first = int(np.argmax(likelihood.echo)) if likelihood.echo.any() else 0
     models = build_models(config, likelihood.ranges, likelihood.geometry, first, floor_below)
-    second = _layover(ping, swath, likelihood)
-    alike = variances.bins_alike(ping.snapshot.iq, ping.snapshot.usable)
-    return Look(ping, swath, models, likelihood, loud, loudest, second, floor_below, alike)
+    alike = variances.bins_alike(snapshot.iq, snapshot.usable)
+    seen = Look(
+        ping, staves, snapshot, swath, models, likelihood, loud, loudest, None, floor_below, alike
+    )
+    return seen if config.layover_used == 'ignored' else evolve(seen, layover=_layover(seen))
 
 
-def _layover(ping: Ping, swath: Swath, likelihood: PingLikelihood) -> Layover | None:
+def _even_part(seen: Look) -> tuple[np.ndarray, PingLikelihood]:
+    """The samples (T, m) of the longest run of live staves, which fits of several waves need, and
+    a likelihood whose noise is that of these staves on average."""
+    staves, likelihood = seen.staves, seen.likelihood
+    noise = likelihood.noise * (float(staves.noise[staves.run].mean()) / staves.level)
+    return seen.snapshot.iq[:, staves.run], likelihood._replace(noise=noise)
+
+
+def _layover(seen: Look) -> Layover:
     """Second surfaces, of bins with an echo alone: a burst of noise is no plane wave, nor two.
     With enough staves also of bins with much power, which the gate for one wave passes over."""
-    if ping.config.layover_used == 'ignored':
-        return None
-    snapshot, echo, loud = ping.snapshot, likelihood.echo, None
-    if snapshot.staves >= FEWEST_STAVES:
-        loud = snapshot.usable & ~echo & np.logical_or.accumulate(echo)
-        loud &= variances.mean_power(snapshot.iq) > LOUD * likelihood.noise
+    iq, likelihood = _even_part(seen)
+    echo, usable, loud = likelihood.echo, seen.snapshot.usable, None
+    if iq.shape[1] < 2:
+        return Layover(np.zeros(len(echo)), math.nan, np.zeros(len(echo), bool))
+    if iq.shape[1] >= FEWEST_STAVES:
+        loud = usable & ~echo & np.logical_or.accumulate(echo)
+        loud &= variances.mean_power(iq) > LOUD * likelihood.noise
     has_echo = echo if loud is None else echo | loud
-    iq = np.where(has_echo[:, None], snapshot.iq, 0.0)
-    spacing = swath.geometry.spacing
+    iq = np.where(has_echo[:, None], iq, 0.0)
+    spacing = seen.swath.geometry.spacing
     return layover(iq, likelihood.signal, likelihood.noise, echo, spacing, loud)
 
 
@@ -196,6 +207,13 @@ def run(seen: Look, favour: FloatArray | None = None) -> Track:
     else:
         entropy = config.seed, seen.ping.snapshot.stamp_ns, int(seen.swath.side == 'port')
         track = run_particles(models, likelihood, config.particles_per_model, entropy)
+        # Where one particle has all the weight, they say nothing of how sure it is.
+        least = models.least_variance
+        if seen.swath.geometry.of_heights:
+            angle, snr = floor_of(seen, track).angle, likelihood.signal / likelihood.noise
+            one = seen.swath.snapshot_std(angle, snr, seen.staves.count)
+            least = np.fmax(least, np.square(LEAST_STD * one))
+        np.maximum(track.covariance[:, 0, 0], least, out=track.covariance[:, 0, 0])
     if config.smoothing_used == 'modes':
         smoothed = smooth_modes(track.probability, models.transition, likelihood.echo)
         track = track._replace(probability=smoothed)
@@ -316,8 +334,9 @@ def _with_constants(track: Track, ping: PingLikelihood) -> Track:
 
 def summarise(seen: Look, track: Track) -> Answer:
     """The answer of a ping whose models were run."""
-    config, snapshot, likelihood = seen.config, seen.ping.snapshot, seen.likelihood
-    echo, usable = likelihood.echo, snapshot.usable
+    config, snapshot, likelihood = seen.config, seen.snapshot, seen.likelihood
+    echo, usable, staves = likelihood.echo, snapshot.usable, seen.staves
+    even, _ = _even_part(seen)
     counts = Counter(
         used=1,
         bins=len(snapshot),
@@ -332,18 +351,18 @@ def summarise(seen: Look, track: Track) -> Answer:
         'log_likelihood_mean': float(track.log_likelihood[echo].mean())
         if echo.any()
         else math.nan,
-        'noise_variance': float(np.median(likelihood.noise)),
+        'noise_variance': float(np.median(likelihood.noise)) / staves.level,
     }
     beyond = usable & (likelihood.ranges >= seen.floor_below)
     loud = LoudBins(
         int(seen.loud.sum()),
         int((seen.loud & ~echo).sum()),
-        variances.decorrelation(snapshot.iq, seen.loud & echo),
+        variances.decorrelation(even, seen.loud & echo),
         math.nan if seen.layover is None else seen.layover.array_error,
         int(beyond.sum()),
         int((beyond & ~echo).sum()),
-        common_mode(snapshot.iq, echo),
-        config.layover_used == 'resolved' and snapshot.staves < FEWEST_STAVES,
+        common_mode(even, echo),
+        config.layover_used == 'resolved' and even.shape[1] < FEWEST_STAVES,
         seen.alike,
     )
     made = estimate_of(seen, track)
@@ -353,20 +372,24 @@ def summarise(seen: Look, track: Track) -> Answer:
     health['decorrelation'] = loud.decorrelation
     health['common_mode'] = loud.common_mode
     health['independent_bins'] = 1.0 / seen.alike
+    health['staves_live'] = staves.count
+    health['phase_tilt_deg'] = math.degrees(staves.sine_std)
     health['residual_ratio'] = _residual(seen, track)
-    return Answer(made, counts, health, loud, health['residual_ratio'])
+    return Answer(made, counts, health, loud, health['residual_ratio'], staves)
 
 
 def _residual(seen: Look, track: Track) -> float:
     """`residual_ratio` of a ping whose noise is stated. Few staves leave too little beside the
     echo, and echoes by way of the surface are no white noise."""
-    config, snapshot, likelihood = seen.config, seen.ping.snapshot, seen.likelihood
-    few = snapshot.staves < FEWEST_STAVES_ALONE
+    config, snapshot, staves = seen.config, seen.snapshot, seen.staves
+    few = staves.count < FEWEST_STAVES_ALONE
     if few or config.multipath or not np.isfinite(stated_noise(snapshot, config)).all():
         return math.nan
     sines = np.sin(floor_of(seen, track).angle)
     spacing = seen.swath.geometry.spacing
-    return residual_ratio(snapshot.iq, sines, spacing, likelihood.noise, likelihood.echo)
+    noise = seen.likelihood.noise * (staves.mean_noise / staves.level)
+    iq, count = snapshot.iq, staves.count
+    return residual_ratio(iq, sines, spacing, noise, seen.likelihood.echo, count)
 
 
 def floor_of(seen: Look, track: Track) -> Floor:
@@ -376,10 +399,14 @@ def floor_of(seen: Look, track: Track) -> Floor:
 
 def _surfaces(seen: Look, track: Track) -> Surfaces | None:
     """Both surfaces where a bin may hold two; None where there are too few staves."""
-    if seen.layover is None or seen.ping.snapshot.staves < FEWEST_STAVES:
+    if seen.layover is None or seen.snapshot.staves < FEWEST_STAVES:
         return None
-    iq, geometry = seen.ping.snapshot.iq, seen.swath.of_heights.geometry
-    return resolve(iq, seen.likelihood, geometry, seen.layover, floor_of(seen, track).height)
+    iq, likelihood = _even_part(seen)
+    if iq.shape[1] < FEWEST_STAVES:  # of an array that has lost some: columns stay
+        nothing = np.full((len(iq), 2), np.nan)
+        return Surfaces(np.minimum(seen.layover.existence, JUST_GATED), nothing, nothing)
+    geometry = seen.swath.of_heights.geometry
+    return resolve(iq, likelihood, geometry, seen.layover, floor_of(seen, track).height)
 
 
 def _with_lower(seen: Look, track: Track, surfaces: Surfaces, two: BoolArray) -> Track:
@@ -399,7 +426,7 @@ def _with_lower(seen: Look, track: Track, surfaces: Surfaces, two: BoolArray) ->
 
 def estimate_of(seen: Look, track: Track) -> Estimate:
     """A row for each bin."""
-    config, snapshot, posed = seen.config, seen.ping.snapshot, seen.ping.posed
+    config, snapshot, posed = seen.config, seen.snapshot, seen.ping.posed
     swath, models, ping = seen.swath, seen.models, seen.likelihood
     label = track.probability.argmax(axis=1)
     doubt = ~ping.echo
@@ -436,22 +463,23 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
     if config.in_bank or config.is_terrain:
         extras['rough'] = np.minimum(track.probability[:, models.rough].sum(axis=1), 1.0)
     extras |= second
-    doubtful = config.doubt(snapshot.sound_speed)
+    doubtful = seen.doubt
     common, aside = swath.doubt(floor, doubtful)
     extras['geometry_std'] = np.sqrt(common).astype(np.float32)
     covariance = covariance.copy()
     if of_heights:
         covariance[:, 0, 0] += common
     else:  # the tilt is no part of an angle from broadside
-        turn = doubtful.spacing**2 + doubtful.sound_speed**2
-        covariance[:, 0, 0] += turn * np.square(np.tan(np.nan_to_num(floor.angle)))
+        tangent = np.square(np.tan(np.nan_to_num(floor.angle)))
+        covariance[:, 0, 0] += (doubtful.spacing**2 + doubtful.sound_speed**2) * tangent
+        covariance[:, 0, 0] += doubtful.sine**2 * (1.0 + tangent)
     if posed is not None:
         vertical, horizontal = swath.uncertainties(floor, config.budget())
         vertical, horizontal = vertical + common, horizontal + aside
         extras |= {
             'vertical_uncertainty': vertical,
             'horizontal_uncertainty': horizontal,
-            'intensity': intensity(snapshot),
+            'intensity': intensity(seen.staves.heard(snapshot.iq)),
             'beam_angle': swath.beam_angle(floor.angle),
             **places(floor.xyz),
         }
@@ -481,7 +509,7 @@ def _label_columns(seen: Look, track: Track, floor: Floor) -> dict[str, np.ndarr
     swath, ping = seen.swath, seen.likelihood
     rough = np.minimum(track.probability[:, seen.models.rough].sum(axis=1), 1.0)
     snr = ping.signal / ping.noise
-    detectable = DETECTABLE * swath.snapshot_std(floor.angle, snr, seen.ping.snapshot.staves)
+    detectable = DETECTABLE * swath.snapshot_std(floor.angle, snr, seen.staves.count)
     kind = verdict(rough, detectable, seen.config.rough_std)
     kind[~ping.echo] = CANNOT_TELL
     return {
@@ -506,7 +534,7 @@ def _upper(seen: Look, surfaces: Surfaces, two: BoolArray) -> dict[str, np.ndarr
     height, variance = (np.where(two, part[:, 1], 0.0) for part in surfaces[1:])
     unposed = seen.ping.posed is None
     floor = swath.of_heights.floor(height, variance)
-    common, aside = swath.doubt(floor, config.doubt(seen.ping.snapshot.sound_speed))
+    common, aside = swath.doubt(floor, seen.doubt)
     std = np.sqrt(variance + common + (config.sonar_height_std**2 if unposed else 0.0))
     columns: dict[str, np.ndarray] = {
         'height_2': height.astype(np.float32),
@@ -545,49 +573,16 @@ def _swath(ping: Ping) -> tuple[Swath, float]:
     return swath, max(posed.altitude + above, 0.01)
 
 
-def intensity(snapshot: Snapshot) -> FloatArray:
-    """Mean power of a stave in each bin (T,), dB; -inf for silent bins."""
+def intensity(iq: np.ndarray) -> FloatArray:
+    """Mean power of the staves of iq (T, P) in each bin (T,), dB; -inf for silent bins."""
     with np.errstate(divide='ignore', invalid='ignore'):
-        return 10.0 * np.log10(variances.mean_power(snapshot.iq))
+        return 10.0 * np.log10(variances.mean_power(iq))
 
 
 def array_height(config: BathymetryConfig, poses: Pose) -> float:
     """z of the array in the world, m, mean over the ping."""
     lever = poses.R @ np.array(config.sonar_lever)
     return float((poses.position + lever)[:, 2].mean())
-
-
-def residual_ratio(
-    iq: np.ndarray,
-    sines: FloatArray,
-    spacing: float,
-    noise: FloatArray,
-    chosen: BoolArray,
-) -> float:
-    """Whether the noise that a sonar states can be true: the mean of r over the bins `chosen`
-    (T,); NaN when they are less than `FEWEST_BINS`.
-
-    What is left of the P staves of a bin y beside the echo from the estimated direction,
-
-        r = (|y|^2 - |a^H y|^2 / P) / ((P - 1) sn2),
-
-    is noise in P - 1 directions, by the noise variance sn2 that is stated: its mean is 1 whatever
-    the floor sends back and whether or not its power fades (`acoustics.laplace`), and in n bins it
-    is known to sqrt(3 / n) or better. A second echo in a bin and staves that do not agree raise
-    it, a direction that is fitted to the noise lowers it by a few hundredths.
-
-    iq (T, P); sines (T,) of the estimated directions from broadside; spacing of the staves in
-    wavelengths; noise (T,) variance at a stave.
-    """
-    chosen = chosen & np.isfinite(sines)
-    if np.count_nonzero(chosen) < FEWEST_BINS:
-        return math.nan
-    y = np.asarray(iq[chosen], np.complex128)
-    staves = y.shape[1]
-    phase = 2.0 * math.pi * spacing * sines[chosen][:, None] * np.arange(staves)
-    beam = np.abs((y * np.exp(-1j * phase)).sum(axis=1))
-    left = np.square(np.abs(y)).sum(axis=1) - np.square(beam) / staves
-    return float(np.mean(left / ((staves - 1) * noise[chosen])))
 
 
 def sound_speed_of(snapshot: Snapshot, config: BathymetryConfig) -> float:

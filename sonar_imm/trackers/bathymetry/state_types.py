@@ -10,15 +10,17 @@
 
 from __future__ import annotations
 
+from ...acoustics.calibration import Calibration
 from ...acoustics.geometry import Pose
 from ...intake.stream import STREAM_TYPES
 from ...measurements import Altitude, Navigation, Snapshot
 from ..navigation import NavigationBuffer
-from .ping import LoudBins, Ping, PosedPing
+from .findings import LoudBins, Sign
+from .ping import Ping, PosedPing
 from .tracker import Alone
 
 STATE_TYPES = (
     *STREAM_TYPES,
     *(Altitude, Navigation, Snapshot, NavigationBuffer, Pose),
-    *(Alone, Ping, PosedPing, LoudBins),
+    *(Alone, Ping, PosedPing, LoudBins, Calibration, Sign),
 )

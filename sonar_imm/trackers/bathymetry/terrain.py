@@ -89,11 +89,11 @@ class Terrain(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def terrain_of(width: float) -> Terrain:
-    """The models for bins `width` m wide."""
-    names = tuple(kind.name for kind in KINDS)
+def terrain_of(width: float, kinds: tuple[Kind, ...] = KINDS) -> Terrain:
+    """Return the models for bins `width` m wide."""
+    names = tuple(kind.name for kind in kinds)
     rough, walk, turn, scatter, stay, share = (
-        np.array(column) for column in list(zip(*KINDS))[1:]
+        np.array(column) for column in list(zip(*kinds))[1:]
     )
     growth = np.sqrt(width / BIN)
     follow = np.isfinite(turn)
@@ -102,7 +102,7 @@ def terrain_of(width: float) -> Terrain:
     level, steady = names.index('level'), names.index('steady')
     stationary = share / share.sum()
     left = stationary * np.minimum(width / stay, MOST_LEFT)
-    flows = 1.0 - np.eye(len(KINDS))
+    flows = 1.0 - np.eye(len(kinds))
     flows[level, steady] = flows[steady, level] = FEWER_FLOWS
     x = np.sqrt(left)
     for _ in range(_ROUNDS):

@@ -45,7 +45,7 @@ particle filters for side scan bathymetry*, OCEANS 2013.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from functools import cached_property
 import math
 from typing import Any, ClassVar, NamedTuple
@@ -53,6 +53,7 @@ from typing import Any, ClassVar, NamedTuple
 from attrs import define, evolve, field, frozen
 import numpy as np
 
+from ...acoustics.calibration import Calibration
 from ...acoustics.layover import Layover
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
@@ -61,6 +62,18 @@ from ...intake.stream import Stream, StreamRules
 from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
 from ..navigation import MOST_WAITING, NavigationBuffer
 from .config import BathymetryConfig
+from .findings import (
+    FEWEST_PINGS,
+    LoudBins,
+    noise_warnings,
+    Sign,
+    sign_evidence,
+    sign_warnings,
+    stave_warnings,
+    staves_of,
+    TILTS,
+    with_open_start,
+)
 from .grid_kernels import Track
 from .ping import (
     Answer,
@@ -68,7 +81,6 @@ from .ping import (
     floor_of,
     Look,
     look,
-    LoudBins,
     Ping,
     PosedPing,
     run,
@@ -86,11 +98,8 @@ MUCH_ARRAY_ERROR = 0.01
 """From here on the test for a second surface misses many."""
 SOME_DECORRELATION = 0.04
 """Noise, slopes and rough floor make neighbouring staves differ by so much in any case."""
-FEWEST_PINGS = 5
 SOME_ALIKE = 1.2
 """So many bins that say the same as one are worth a sentence."""
-NOISE_BOUNDS = 0.5, 2.0
-"""Between these ratios of its residual the noise is as stated, as far as the test goes."""
 NEIGHBOURS_NS = 5_000_000_000
 """Pings of one side further apart in time are no neighbours."""
 KEPT_NS = 60_000_000_000
@@ -104,13 +113,15 @@ class BathymetryTracker:
     """The tracker of `trackers.Tracker` for the sea floor: `process` takes `Snapshot`,
     `Navigation` and `Altitude`."""
 
-    STATE = ('_queue', '_coupling', '_health', '_loud', '_residuals')
+    STATE = ('_queue', '_coupling', '_health', '_loud', '_residuals', '_staves', '_signs')
 
     _queue: PoseQueue
     _coupling: Coupling
     _health: dict[str, float]
     _loud: deque[LoudBins]
     _residuals: deque[float]
+    _staves: deque[Calibration]
+    _signs: dict[str, Sign]
 
     def __init__(self, config: BathymetryConfig):
         self.config = config
@@ -123,12 +134,16 @@ class BathymetryTracker:
         self._health = {}
         self._loud = deque(maxlen=PINGS_JUDGED)
         self._residuals = deque(maxlen=PINGS_JUDGED)
+        self._staves = deque(maxlen=PINGS_JUDGED)
+        self._signs = {}
 
     @property
     def frames(self) -> KnownFrames:
         return self._queue.frames
 
     def reconfigure(self, config: BathymetryConfig) -> None:
+        if config.conjugate != self.config.conjugate:
+            self._signs = {}
         self.config = config
 
     def remount(self, config: BathymetryConfig) -> None:
@@ -184,7 +199,8 @@ class BathymetryTracker:
     def warnings(self) -> list[str]:
         """What of the last pings makes most echoes useless, or more sure than they are."""
         loud = sum(ping.bins for ping in self._loud)
-        stated = [*self._silence(), *self._common_mode(), *noise_warnings(self._residuals)]
+        stated = [*sign_warnings(list(self._signs.values())), *stave_warnings(self._staves)]
+        stated += [*self._silence(), *self._common_mode(), *noise_warnings(self._residuals)]
         if self._used is not self.config and self._loud:
             stated.append(
                 f'the array looks down (tilt {self.config.tilt_deg:g} deg): angle models are used'
@@ -221,6 +237,24 @@ class BathymetryTracker:
                 'element_spacing_wavelengths'
             )
         return sentences
+
+    def array(self) -> dict[str, Any]:
+        """What the last pings show of each stave, stave 0 first: `stave_gain`, by which samples
+        are divided, `stave_phase_deg`, which is taken off them, `stave_coherence`, `stave_live`;
+        and `independent_bins` of a bin, and `phase_tilt_deg`, which the phases leave. Nothing of
+        fewer than five pings."""
+        found = staves_of(self._staves)
+        if found is None:
+            return {}
+        gain = 10.0 ** (found.gain_db / 20.0)
+        return {
+            'stave_gain': np.round(gain, 4).tolist(),
+            'stave_phase_deg': np.round(found.phase_deg, 2).tolist(),
+            'stave_coherence': np.round(found.coherence, 3).tolist(),
+            'stave_live': found.live.tolist(),
+            'independent_bins': round(1.0 / float(np.median([p.alike for p in self._loud])), 3),
+            'phase_tilt_deg': round(found.tilt_deg, 3),
+        }
 
     def _silence(self) -> list[str]:
         """What to say when most bins where a floor can be are passed over, loud or not."""
@@ -278,12 +312,12 @@ class BathymetryTracker:
             self.counts['other_spacing'] += 1
             return []
         elif not self._moving:
-            return [Ping(self._used, measurement, None)]
+            return [self._with_sign(Ping(self._used, measurement, None))]
         else:
             self._queue.add_ping(measurement)
         if not self._moving:
             return []
-        return self._queue.ready(self._used)
+        return [self._with_sign(ping) for ping in self._queue.ready(self._used)]
 
     @staticmethod
     def work(task: Ping) -> Answer | Alone:
@@ -306,7 +340,22 @@ class BathymetryTracker:
         self._health = answer.health
         self._loud.append(answer.loud)
         self._residuals.append(answer.residual)
+        self._staves.append(answer.staves)
         return answer.estimate
+
+    def _with_sign(self, ping: Ping) -> Ping:
+        """The ping with the sign of the phase that the first pings of its side have shown."""
+        config = ping.config
+        if not config.conjugate_auto or not TILTS[0] <= config.tilt_deg < TILTS[1]:
+            return ping
+        side = ping.snapshot.side or config.side
+        sign = self._signs.get(side, Sign())
+        if sign.is_open:
+            sign = Sign(sign.evidence + _evidence_of_sign(ping), sign.pings + 1)
+            self._signs[side] = sign
+        if not sign.is_turned:
+            return ping
+        return evolve(ping, config=evolve(config, conjugate=not config.conjugate))
 
     @property
     def _used(self) -> BathymetryConfig:
@@ -327,26 +376,21 @@ class BathymetryTracker:
         return abs(stated / configured - 1.0) > SPACING_TOLERANCE
 
 
+def _evidence_of_sign(ping: Ping) -> float:
+    """What a ping says of the sign of its phase, see `Sign`; nothing without echoes."""
+    config = with_open_start(ping.config)
+    seen = look(evolve(ping, config=config))
+    unknown = config.calibrate_array and not config.multipath and not seen.staves.fits.all()
+    if unknown or np.count_nonzero(seen.likelihood.echo) < FEWEST_LOUD:
+        return 0.0
+    turned = look(evolve(ping, config=evolve(config, conjugate=not config.conjugate)))
+    return sign_evidence(run(seen).log_likelihood, run(turned).log_likelihood)
+
+
 def _again(ping: Favoured) -> Answer:
     """The answer of a ping, given what its neighbours favour."""
     seen, favour = ping.alone.seen, ping.favour
     return summarise(seen, ping.alone.track if favour is None else run(seen, favour))
-
-
-def noise_warnings(ratios: Sequence[float]) -> list[str]:
-    """What the ratios (`ping.residual_ratio`) of the last pings say of the stated noise, in
-    sentences. Only a mean that is wrong by 3 dB counts, and only when the median ping shows it."""
-    known = [ratio for ratio in ratios if math.isfinite(ratio)]
-    if len(known) < FEWEST_PINGS:
-        return []
-    typical = float(np.median(known))
-    if NOISE_BOUNDS[0] <= typical <= NOISE_BOUNDS[1]:
-        return []
-    advice = '' if typical < 1.0 else ', decorrelation and element_spacing_wavelengths'
-    return [
-        f'what the sensor states cannot be true: beside the echo the staves have {typical:.2g} '
-        f'times the noise that is stated; check noise_variance{advice}'
-    ]
 
 
 @define(eq=False)

@@ -214,8 +214,11 @@ def spawn_stage(
         found = [birth for group in scan.fixes for birth in group.births] + scan.births
         if found:
             room = max(0, max_total_tracks(config) - len(known))
-            begun = without_duplicate_ids(found)[:room]
+            new = without_duplicate_ids(found)
+            begun = new[:room]
             known = with_tracks(known, begun)
+            if left := sum(birth.target_id != NOBODY for birth in new[room:]):
+                known = known.add_counts(names_without_track=left)
             ids = known.life.track_id[len(known) - len(begun) :].tolist()
             marks = {birth.mark: each for birth, each in zip(begun, ids) if birth.mark}
         known = links.resolve_links(known, marks)
@@ -390,14 +393,19 @@ def confirm_newest(known: Known) -> Known:
 
 
 def start_warnings(known: Known, config: DiverConfig) -> list[str]:
-    """Return a warning about starts without a track."""
-    count = known.counts.get('not_started', 0)
-    if not count:
-        return []
-    return [
-        f'{count} starts ignored: max_tracks ({config.max_tracks}) tracks are confirmed. Increase '
-        'max_tracks'
-    ]
+    """Return warnings about starts and names without a track."""
+    found = []
+    if count := known.counts.get('not_started', 0):
+        found.append(
+            f'{count} starts ignored: max_tracks ({config.max_tracks}) tracks are confirmed. '
+            'Increase max_tracks'
+        )
+    if count := known.counts.get('names_without_track', 0):
+        found.append(
+            f'{count} positions with a name of their own started no track: there are '
+            f'{max_total_tracks(config)}. Increase max_tracks, or give names that stay'
+        )
+    return found
 
 
 def _agrees_with_start(

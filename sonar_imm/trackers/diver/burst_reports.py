@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 
 
-"""Numbers and sentences about bursts and outliers (`bursts`)."""
+"""Numbers and sentences about bursts, outliers and sensors that disagree (`bursts`)."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from ...estimation.association import TENTATIVE
 from . import bursts
 from .config import DiverConfig
 from .known import Feature, Known
+from .scales import delay_probabilities
 from .scan import Scan
 from .sensors import Sensors
 
@@ -30,6 +31,9 @@ whether the last fix of the track began an offset or was an outlier."""
 
 ENOUGH_ALONE = 3
 """Number of outliers for a sentence about them."""
+
+SURELY_LATE = 0.95
+"""Probability of a delay of a sensor that triggers a warning."""
 
 ENOUGH_OTHERS = 10
 """Number of fixes of either sensor for a sentence about two sensors."""
@@ -48,12 +52,13 @@ class BurstCounts(NamedTuple):
     """Number of outliers."""
     taken: int = 0
     """Number of fixes of tracks, with these."""
+    explained: tuple[str, ...] = ()
+    """Offsets between sensors, and delays, that are known now."""
 
-    def warnings(self, apart: bool) -> list[str]:
-        """Return sentences about bursts and outliers. apart: whether two sensors disagree, which
-        has a sentence of its own."""
+    def warnings(self) -> list[str]:
+        """Return sentences about bursts and outliers."""
         found = []
-        if self.runs > apart:
+        if self.runs:
             runs = f'{self.runs} runs' if self.runs > 1 else '1 run'
             found.append(
                 f'{self.fixes} fixes in {runs} lay {self.nearest:.2g} m or more from where the '
@@ -75,6 +80,8 @@ class Burst(NamedTuple):
     row: int
     offset: np.ndarray
     """(2,) m."""
+    of_sensors: bool
+    """Whether it is the offset between sensors that disagree."""
 
 
 def count_bursts(known: Known, scan: Scan) -> Known:
@@ -82,20 +89,30 @@ def count_bursts(known: Known, scan: Scan) -> Known:
     if not scan.fixes or not len(known):
         return known
     counts: BurstCounts = known.memory['bursts']
-    if bursts.turning(known).any():
-        # What was taken for outliers is the other place.
+    running = list(current_bursts(known))
+    explained = (
+        *('two places' for _ in np.flatnonzero(bursts.turning(known))),
+        *('two sensors' for burst in running if burst.of_sensors),
+        *(f'late {number}' for number in late_sensors(known)),
+    )
+    if not set(explained) <= set(counts.explained):
+        # What was taken for bursts, outliers or wrong covariances before was this.
         counts = BurstCounts(taken=counts.taken)
+        known = known.with_memory(fixes=known.memory['fixes'].without_sums())
+    counts = counts._replace(explained=explained)
     rows, T = known.rows, len(known)
     hit, before, since = known['nis_dof'] > 0, known['strange'], np.zeros(T, np.int64)
     taken = [group.association.taken for group in scan.fixes if group.association is not None]
     strange = np.any(taken, axis=0) & ~hit
     counts = counts._replace(taken=counts.taken + int((hit | strange).sum()))
     bursting = np.zeros(T, np.bool_)
-    for burst in current_bursts(known):
+    for burst in running:
         start, fixes = (int(rows.key[name][burst.row]) for name in ('since', 'fixes'))
         old = start == known['burst_since'][burst.track]
         took = int(rows.key['took'][burst.row] == known.stamp_ns)
         bursting[burst.track], since[burst.track] = True, start
+        if burst.of_sensors:
+            continue
         counts = counts._replace(
             runs=counts.runs + (not old),
             fixes=counts.fixes + (took if old else fixes),
@@ -107,24 +124,26 @@ def count_bursts(known: Known, scan: Scan) -> Known:
 
 
 def current_bursts(known: Known) -> Iterator[Burst]:
-    """Yield the burst of each confirmed track that has one, of two fixes or more."""
+    """Yield the burst of each confirmed track that has one, of two fixes or more; of three in
+    scans of several targets, where two may be false fixes."""
     rows, T = known.rows, len(known)
     if not rows.tail:
         return
-    counted = (rows.key['offset'] >= 0) & (rows.key['fixes'] >= 2) & ~rows.key['turns']
-    running = np.where(counted, rows.weight, 0.0)
+    key = rows.key
+    enough = key['fixes'] >= np.where(key['link'] != 0, 3, 2)
+    running = np.where((key['offset'] >= 0) & enough & ~key['turns'], rows.weight, 0.0)
     offset = bursts.row_offsets(rows)
     firm = known.life.status != TENTATIVE
     for track in np.flatnonzero((rows.total(running, T) > 0.5) & firm).tolist():
         own = known.row_indices(track)
         row = int(own[running[own].argmax()])
-        yield Burst(track, row, offset[row])
+        counts = min(int(rows.key[name][row]) for name in ('others', 'fixes'))
+        yield Burst(track, row, offset[row], counts >= ENOUGH_OTHERS)
 
 
 def warnings(known: Known, config: DiverConfig) -> list[str]:
     """Return sentences about bursts and outliers, and about bursts that last."""
     found: list[str] = []
-    apart = False
     rows, sensors = known.rows, known.memory['sensors']
     readings = bursts.reading_weights(rows, config.burst_end)
     apart_in_turns = np.flatnonzero(bursts.turning(known) & (known.life.status != TENTATIVE))
@@ -134,9 +153,7 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         found.append(_places_apart(offset[own[rows.logw[own].argmax()]]))
     for burst in current_bursts(known):
         row, distance = burst.row, np.hypot(*burst.offset)
-        others, fixes = (int(rows.key[name][row]) for name in ('others', 'fixes'))
-        if min(others, fixes) >= ENOUGH_OTHERS:
-            apart = True
+        if burst.of_sensors:
             found.append(_sensors_apart(sensors, int(rows.key['offset'][row]), burst.offset))
             continue
         other = 'the track was wrong before' if rows.key['link'][row] == 0 else 'another target'
@@ -146,7 +163,23 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
             f'{distance:.2g} m off: a burst ({1.0 - readings[row]:.2g}), or {other}; the estimate '
             'holds both'
         )
-    return [*known.memory['bursts'].warnings(apart), *found]
+    for number, (delay, weight) in late_sensors(known).items():
+        found.append(
+            f'the stamps of sensor {sensors.names[number] or "without a name"} are {delay:.2g} s '
+            f'late ({weight:.2g}): the estimate corrects them'
+        )
+    return [*known.memory['bursts'].warnings(), *found]
+
+
+def late_sensors(known: Known) -> dict[int, tuple[float, float]]:
+    """Return delay, s, and its probability by the number of each sensor whose stamps are late."""
+    found, firm = {}, known.life.status != TENTATIVE
+    for number in np.flatnonzero(known.rows.key['delay'].any(axis=0)).tolist():
+        delay, weight = delay_probabilities(known.rows, number)
+        if (firm & (weight > SURELY_LATE)).any():
+            track = int(np.where(firm, weight, 0.0).argmax())
+            found[number] = float(delay[track]), float(weight[track])
+    return found
 
 
 def _places_apart(offset: np.ndarray) -> str:

@@ -58,7 +58,7 @@ ENDED = {name: value for name, value in NO_OFFSET.items() if name not in ('took'
 """Assumptions about offsets of a row without one."""
 
 
-MOST_BURSTS, LONGEST_BURST = 4, 60
+MOST_BURSTS, LONGEST_BURST = 8, 60
 """Scans of several targets: maximum number of burst rows of a track, and of fixes of a burst."""
 
 PLAIN_LOST = math.log(1e-12)
@@ -99,14 +99,20 @@ def begin_rows(
     link: IntArray,
     models: ModelSet,
     estimated: Sequence[BoolArray | None],
-) -> Rows | None:
-    """Return the rows that the ways lead to, with the log weights `logw` (E,); None for none.
+) -> list[Rows]:
+    """Return the rows that the ways lead to, with the log weights `logw` (E,), if any.
 
     link: (D,) link of a burst that begins with each fix.
     """
     kept = np.flatnonzero(logw > -np.inf)
     if not len(kept):
-        return None
+        return []
+    # A delay may have stood for the offset that begins: half of the weight is without it.
+    late = (known.rows.key['delay'][ways.row[kept]] > 0.0).any(axis=1) & (ways.way[kept] == OPEN)
+    logw = logw[kept] - math.log(2.0) * late
+    again = np.flatnonzero(late)
+    on_time = np.append(np.zeros(len(kept), np.bool_), late[again])
+    kept, logw = np.append(kept, kept[again]), np.append(logw, logw[again])
     row, fix, way = ways.row[kept], ways.fix[kept], ways.way[kept]
     rows = known.rows.with_tail(TAIL).select(row)
     opens, outliers = way == OPEN, way == OUTLIER
@@ -121,6 +127,7 @@ def begin_rows(
     key['others'] = np.where(plain, 0, key['others'] + without)
     key['took'] = np.where(outliers, key['took'], known.stamp_ns)
     key['aside'] = outliers & (key['offset'] < 0)
+    key['delay'] = np.where(on_time[:, None], 0.0, key['delay'])
     late, velocities = key['delay'][:, sensor], [part.outputs[2:4] for part in models.parts]
     started = _with_prior(rows.blocks, plain, np.where(opens, ways.variance[kept], 0.0))
     key['link'] = np.where(opens, link[fix], np.where(plain, 0, key['link']))
@@ -145,7 +152,7 @@ def begin_rows(
         factors.append(done[1])
     sound, _ = repair_covariances(tuple(blocks), TAIL)
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
-    return rows.replace(key=key, logw=logw[kept], parent=known.rows.parent[row])
+    return [rows.replace(key=key, logw=logw, parent=known.rows.parent[row])]
 
 
 def with_tail_mask(mask: BoolArray | None, tail: int) -> BoolArray | None:
@@ -366,13 +373,11 @@ def _heaviest(rows: Rows, counted: BoolArray, most: int) -> BoolArray:
     return kept
 
 
-def divided(rows: Rows, began: Rows | None) -> BoolArray:
+def divided(rows: Rows, began: Sequence[Rows]) -> BoolArray:
     """Return the rows (N,) of targets with several rows of a scale: `drop_rows` drops them."""
     strange = (rows.key['offset'] >= 0) | rows.key['aside']
-    targets = rows.target[strange]
-    if began is not None:
-        targets = np.concatenate([targets, began.target])
-    return np.isin(rows.target, targets)
+    targets = [rows.target[strange], *(new.target for new in began)]
+    return np.isin(rows.target, np.concatenate(targets))
 
 
 def without_unused_tail(rows: Rows) -> Rows:

@@ -300,7 +300,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
     # -- names -----------------------------------------------------------------------------------
     tags: tuple[str, ...] = parameter((), '',
         'names of tags or divers: what comes on <name>/fix or <name>/relative, or in a frame of '
-        'that name, belongs to this diver and goes to his own track without association',
+        'that name, belongs to this target and goes to its own track without association',
         kind='str[]')
     repeat_time: float = parameter(5.0, 's',
         'time within which the same values again are a repeated poll, which is left out and '

@@ -13,8 +13,8 @@ the covariances that scales grant, no fix is far from the track. So if the means
 innovations of two sensors differ significantly, a row begins with scales 1 and an offset of the
 sensor that reports. Both readings of an offset are even then (`bursts`).
 
-Two sensors may report as one. If the last innovations of a sensor lie in two groups that take
-turns, rows begin whose offset turns: each fix has it or not.
+Two sensors may report as one. If the last innovations of the only sensor lie in two groups that
+take turns, rows begin whose offset turns: each fix has it or not.
 
 Source: docs/diver.md, 'Several sensors'.
 """
@@ -104,15 +104,17 @@ def record_innovations(known: Known, group: Group, models: ModelSet) -> Known:
     if not len(tracks):
         return known
     fix = association.fix[tracks]
-    turning = bursts.turning(known)[tracks]
     scale = (
         estimated_scales(known.rows, group.number)[tracks]
         if len(models.scales) > 1
         else np.ones(len(tracks))
     )
     R = group.R[fix] * scale[:, None, None]
-    # Of two places in turn, the innovations tell nothing about covariances.
-    tentative = (known.life.status == TENTATIVE)[tracks] | turning
+    # Of two places in turn, and of late stamps on a bend, innovations do not show covariances.
+    key = known.rows.key
+    other = np.where(key['turns'] | key['delay'].any(axis=1), known.rows.weight, 0.0)
+    explained = known.rows.total(other, len(known)) > 0.5
+    tentative = ((known.life.status == TENTATIVE) | explained)[tracks]
     before: FixConsistency = known.memory['fixes'].of(group.number)
     white, after = whiten_innovations(
         mean[tracks],
@@ -124,8 +126,6 @@ def record_innovations(known: Known, group: Group, models: ModelSet) -> Known:
         before,
     )
     after = after.with_scale(scale, tentative)
-    if turning.any():
-        after = FixConsistency(stated=before.stated, assumed=before.assumed)
     names = 'white', 'nis', 'nis_dof', 'reported', 'lately'
     columns = {name: known[name].copy() for name in names}
     columns['white'][tracks, group.number] = white
@@ -195,9 +195,9 @@ def two_places(innovations: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def begin_disagreement(
     known: Known, group: Group, models: ModelSet, estimated: Sequence[BoolArray | None]
-) -> Rows | None:
+) -> list[Rows]:
     """Return rows with an offset of the sensor, for tracks whose sensors disagree, or whose sensor
-    shows two places in turn; None for none.
+    shows two places in turn, if any.
 
     A track that has a row with an offset gets none.
 
@@ -205,17 +205,18 @@ def begin_disagreement(
     """
     association, rows, T = group.association, known.rows, len(known)
     if association is None or not T:
-        return None
+        return []
     held = np.bincount(rows.target, rows.key['offset'] >= 0, T) > 0.0
     free = association.taken & ~held
     fix = association.beta.argmax(axis=1) if len(group.z) else association.fix
     distance, std = two_places(known['innovations'])
     R = group.R[fix].trace(axis1=1, axis2=2) / 2.0 if len(group.z) else std
     turns = free & (distance > SEPARATE * std) & (np.square(distance) > DISAGREE * R)
+    turns &= len(known.memory['sensors'].names) == 1
     found = free & association.hit & sensors_disagree(known['lately'], group.number) & ~turns
     track = np.flatnonzero(found | turns)
     if not len(track):
-        return None
+        return []
     # Of two places in turn, scales explain what is stated too small besides.
     usual = [s for s in models.scales if 1.0 <= s <= USUAL_SCALES[1]]
     each = [(t, s) for t in track.tolist() for s in (usual if turns[t] else [1.0])]
@@ -244,8 +245,6 @@ def begin_disagreement(
     )
     stated = known.replace(rows=started.replace(key=key, blocks=tuple(blocks)))
     weight, link = np.full(N, math.log(BEGINS)), np.zeros(len(group.z), np.int64)
-    began = bursts.begin_rows(stated, group, ways, weight, link, models, estimated)
-    if began is None:
-        return None
+    (began,) = bursts.begin_rows(stated, group, ways, weight, link, models, estimated)
     taken = np.zeros_like(began.key['taken'])
-    return evolve(began, key={**began.key, 'taken': taken}, parent=rows.parent[row])
+    return [evolve(began, key={**began.key, 'taken': taken}, parent=rows.parent[row])]

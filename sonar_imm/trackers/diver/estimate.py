@@ -34,10 +34,7 @@ from .config import DiverConfig
 from .known import Known
 from .models import FAMILIES, HOVER, ModelSet
 from .pruning import PUBLISH_EXISTENCE
-from .scales import delay_probabilities, estimated_scales, weight_without_small_scales
-
-SURELY_LATE = 0.95
-"""Probability of a delay of a sensor that triggers a warning."""
+from .scales import estimated_scales, weight_without_small_scales
 
 
 def estimate_of(
@@ -151,6 +148,7 @@ def health(known: Known, waiting: int) -> dict[str, float]:
         'broken_tracks': known.counts.get('broken', 0),
         'covariance_repairs': known.counts.get('repairs', 0),
         'not_started': known.counts.get('not_started', 0),
+        'names_without_track': known.counts.get('names_without_track', 0),
         'fixes_mean_nis': known.memory['fixes'].together.mean_nis,
         'fixes_lag_1': known.memory['fixes'].together.lag_1,
         'arrivals_mean_nis': known.memory['arrivals'].mean,
@@ -182,7 +180,6 @@ def warnings(known: Known, config: DiverConfig, models: ModelSet) -> list[str]:
     of_scans = [
         *(assumed if config.has_usual_fix_std else []),
         *fixes,
-        *late_warnings(known),
         *burst_reports.warnings(known, config),
         *clutter.warnings(memory['clutter'], config, tracked),
     ]
@@ -196,18 +193,3 @@ def warnings(known: Known, config: DiverConfig, models: ModelSet) -> list[str]:
         *ranges.warnings(known),
         *births.start_warnings(known, config),
     ]
-
-
-def late_warnings(known: Known) -> list[str]:
-    """Return a warning for each sensor whose stamps are late."""
-    found, firm = [], known.life.status != TENTATIVE
-    for number, name in enumerate(known.memory['sensors'].names):
-        delay, weight = delay_probabilities(known.rows, number)
-        if not (firm & (weight > SURELY_LATE)).any():
-            continue
-        track = int(np.where(firm, weight, 0.0).argmax())
-        found.append(
-            f'the stamps of sensor {name or "without a name"} are {delay[track]:.2g} s late '
-            f'({weight[track]:.2g}): the estimate corrects them'
-        )
-    return found

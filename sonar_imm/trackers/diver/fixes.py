@@ -20,7 +20,7 @@ Source: docs/diver.md, 'Association'.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import math
 from typing import Any
 
@@ -46,7 +46,7 @@ from .disagreement import begin_disagreement, record_innovations
 from .known import Feature, Known, repair_covariances
 from .models import ModelSet
 from .pairs import Association, Assumptions, Pairs
-from .scales import can_restore, lending, protected_rows
+from .scales import can_restore, lending, protected_rows, rescaled_rows
 from .scan import Group
 
 FEATURES = {
@@ -300,21 +300,13 @@ def update_tracks(
     of_row = np.empty(len(known.rows), np.int64)
     of_row[among.row[among.has_row]] = of[among.has_row]
     rows, borrowed, of_ways = _update_weights(known, pairs, factor, beta, logs, of_row)
-    began = None
+    began: list[Rows] = []
     if pairs.ways is not None:
         of_ways = links.weights_of_ways(known, group, pairs.ways, of_ways, association)
-        began = bursts.begin_rows(
-            known,
-            group,
-            pairs.ways,
-            of_ways,
-            links.links_of_fixes(known, group),
-            models,
-            estimated,
-        )
+        link = links.links_of_fixes(known, group)
+        began += bursts.begin_rows(known, group, pairs.ways, of_ways, link, models, estimated)
     if ways.has_ways(group, models) and ways.is_alone(group):
-        apart = begin_disagreement(known, group, models, estimated)
-        began = apart if began is None else began if apart is None else began.append(apart)
+        began += begin_disagreement(known, group, models, estimated)
     stays = protected_rows(rows) | bursts.divided(rows, began)
     rows, borrowed, left = drop_weightless_rows(rows, borrowed, stays)
     # Pairs of the remaining rows, in row order.
@@ -346,7 +338,8 @@ def update_tracks(
     rows, borrowed = restore_rows(rows, borrowed, again, bursts.ENDED, lend)
     took = association.beta.sum(axis=1) > 0.5 * exists
     rows = bursts.count_fixes(rows, sensor, took[rows.target], known.stamp_ns)
-    if pairs.ways is not None or began is not None or rows.tail:
+    began += rescaled_rows(rows, models.scales, sensor)
+    if pairs.ways is not None or began or rows.tail:
         rows, borrowed = _join_rows(rows, borrowed, began)
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
 
@@ -392,12 +385,14 @@ def _rejected_factor(pairs: Pairs, nearest: IntArray, share: FloatArray) -> Floa
     return np.asarray(1.0 - share[among.target] + gain, np.float64)
 
 
-def _join_rows(rows: Rows, borrowed: Borrowed, began: Rows | None) -> tuple[Rows, Borrowed]:
+def _join_rows(rows: Rows, borrowed: Borrowed, began: Sequence[Rows]) -> tuple[Rows, Borrowed]:
     """Add new rows of offsets, and remove rows of negligible weight.
 
     Return the rows and the borrowed list.
     """
-    rows = bursts.merge_rows(rows if began is None else rows.append(began))
+    for new in began:
+        rows = rows.append(new)
+    rows = bursts.merge_rows(rows)
     rows, borrowed = bursts.drop_rows(rows, borrowed, protected_rows(rows))
     return normalise_weights(bursts.without_unused_tail(rows), borrowed)
 

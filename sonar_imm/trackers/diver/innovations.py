@@ -134,8 +134,8 @@ class FixConsistency(NamedTuple):
         """
         if bias_stated or self.are_too_small or self.number < 0.99 * MEMORY:
             return False
-        small = self.mean_nis < PESSIMISTIC or self.lag_1 > CORRELATED
-        return small and self.mean_nis <= OPTIMISTIC
+        # Large innovations that are correlated are those of a motion that no model has.
+        return self.mean_nis < (1.0 if self.lag_1 > CORRELATED else PESSIMISTIC)
 
     def warnings(self, bias_stated: bool, largest: float = MOST, sensor: str = '') -> list[str]:
         """Return warnings about wrong covariances: for families when the evidence suffices,
@@ -202,6 +202,14 @@ class SensorConsistency(NamedTuple):
         found = [self.of(each) for each in range(max(len(self.sensors), number + 1))]
         found[number] = consistency
         return SensorConsistency(tuple(found))
+
+    def without_sums(self) -> SensorConsistency:
+        """Forget all innovations."""
+        return SensorConsistency(
+            tuple(
+                FixConsistency(stated=each.stated, assumed=each.assumed) for each in self.sensors
+            )
+        )
 
     @property
     def together(self) -> FixConsistency:

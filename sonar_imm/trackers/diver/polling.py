@@ -83,7 +83,7 @@ def remember_single_fixes(known: Known, group: Group) -> Known:
 def turn_of(stamps_ns: IntArray, places: FloatArray) -> Turn | None:
     """Return the turn of a sensor that stamps each fix by itself; None if it does not turn.
 
-    Of the fixes before one, the last that is as near as those of one target are is his.
+    Of the fixes before one, the last that is as near as those of one target are is its own.
 
     :param stamps_ns: (n,) rising, of more than `BEFORE` fixes.
     :param places: (n, 2).

@@ -54,6 +54,9 @@ MOST_BORROWED = 64
 FARTHEST_HEARD = 400.0
 """Squared distance of a fix, relative to the variances, within which a track hears its sensor."""
 
+RESCALED, HEAVY = 8, 0.5
+"""Number of fixes after which rows with an offset get other scales, and their minimum weight."""
+
 DELAYED = 1e-3
 """Prior of any delay of a sensor."""
 
@@ -323,6 +326,38 @@ def protected_rows(rows: Rows) -> BoolArray:
     protected |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
     is_published = scale >= MIN_PUBLISHED_SCALE
     return protected | (weight_without_small_scales(rows) >= ROW_LOST) & is_published
+
+
+def rescaled_rows(rows: Rows, scales: Sequence[float], sensor: int) -> list[Rows]:
+    """Return copies of rows with an offset at the usual scales of a sensor that they lack, if any.
+
+    Such a row keeps the scale it began with, which stood for the offset, maybe: nothing borrows
+    from it. Each `RESCALED` fixes of the sensor, the heaviest rows get the copies.
+    """
+    if not rows.tail:
+        return []
+    key, own = rows.key, rows.key['scale'][:, sensor]
+    number = np.where(key['offset'] == sensor, key['fixes'], key['others'])
+    due = (key['offset'] >= 0) & (own > 0.0) & (number % RESCALED == 0) & (number > 0)
+    due &= ~key['turns'] & (rows.logw > np.log(HEAVY))
+    if not due.any():
+        return []
+    others = np.delete(key['scale'], sensor, axis=1), key['delay'], key['offset'], key['since']
+    alike = np.column_stack([rows.target, *others])
+    usual = [s for s in scales if MIN_PUBLISHED_SCALE <= s <= USUAL_SCALES[1]]
+    row, scale = [], []
+    for k in np.flatnonzero(due).tolist():
+        held = own[(alike == alike[k]).all(axis=1)]
+        lacking = [s for s in usual if not np.isclose(held, s).any()]
+        row += [k] * len(lacking)
+        scale += lacking
+    if not row:
+        return []
+    new = rows.select(np.array(row))
+    table = new.key['scale'].copy()
+    table[:, sensor] = scale
+    logw, parent = new.logw + np.log(ROW_AGAIN), rows.parent[new.parent]
+    return [evolve(new, logw=logw, parent=parent, key={**new.key, 'scale': table})]
 
 
 def can_restore(rows: Rows, borrowed: Borrowed) -> BoolArray:

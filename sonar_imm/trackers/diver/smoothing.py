@@ -254,8 +254,9 @@ class SmoothingDiverTracker(DiverTracker):
                 steps = steps / steps.sum(axis=2, keepdims=True)
             inside = mu[:, block] / total if len(blocks) > 1 else mu
             F, Q, B = (part[:, block] for part in moves)
-            prior = IMMPredicted(*(part[:, block] for part in predicted))
+            prior = None  # of one family, that of `imm_smooth` is the one of the tracker
             if len(blocks) > 1:
+                prior = IMMPredicted(*(part[:, block] for part in predicted))
                 prior = prior._replace(mu=prior.mu / prior.mu.sum(axis=1, keepdims=True))
             result = imm_smooth(x[:, block], P[:, block], inside, steps, F, Q, B, prior)
             self._smoothed_repairs += int(result.repaired.sum())

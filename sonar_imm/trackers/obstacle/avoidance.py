@@ -68,8 +68,8 @@ class Safety(NamedTuple):
 
 
 def course(buffer: NavigationBuffer, stamp_ns: int, window: float) -> FloatArray:
-    """Velocity (3,) m/s ENU of the vehicle: slope of the straight line through its positions of
-    the last `window` seconds. NaN where there are too few."""
+    """Return the velocity (3,) m/s ENU of the vehicle: slope of the straight line through its
+    positions of the last `window` seconds. NaN where there are too few."""
     first = bisect_left(buffer.stamps, stamp_ns - nanoseconds(window))
     last = bisect_right(buffer.stamps, stamp_ns)
     stamps = buffer.stamps[first:last]
@@ -113,8 +113,8 @@ def _safety(velocity: FloatArray, config: ObstacleConfig) -> Safety:
 
 @cache
 def draws() -> FloatArray:
-    """Standard normal points (256, 5) that fill the space evenly: a Kronecker lattice on powers of
-    the root of x^6 = x + 1."""
+    """Return standard normal points (256, 5) that fill the space evenly: a Kronecker lattice on
+    powers of the root of x^6 = x + 1."""
     from scipy.special import ndtri
 
     root = 1.0

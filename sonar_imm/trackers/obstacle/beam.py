@@ -80,13 +80,14 @@ class Elevations(NamedTuple):
     variance: FloatArray
 
     def ends(self) -> FloatArray:
-        """Between which angles (D, 2) the detections lie."""
+        """Return the angles (D, 2) between which the detections lie."""
         reach = REACH * np.sqrt(self.variance)
         return np.column_stack([self.angle - reach, self.angle + reach])
 
     @classmethod
     def of(cls, up: FloatArray, variance: FloatArray, config: ObstacleConfig) -> Elevations | None:
-        """Of elevations `up` (D,) rad, as they are stated; None where none is measured."""
+        """Return those of elevations `up` (D,) rad, as they are stated; None where none is
+        measured."""
         known = np.isfinite(up) & (np.abs(up) < 0.5 * np.pi)
         if not np.count_nonzero(known):
             return None
@@ -140,9 +141,9 @@ def _at_least(turn: FloatArray) -> FloatArray:
 def apply_elevations(
     mixture: Mixture, seen: Elevations, pose: Pose, config: ObstacleConfig
 ) -> tuple[Mixture, FloatArray]:
-    """After one elevation of each obstacle (T,), and the log (T,) of its density beside that of
-    clutter, which is as dense at any elevation in the beam. NaN changes nothing. pose: of the
-    sonar, or of one for each obstacle, see `unscented.points`."""
+    """Return the obstacles after one elevation of each obstacle (T,), and the log (T,) of its
+    density beside that of clutter, which is as dense at any elevation in the beam. NaN changes
+    nothing. pose: of the sonar, or of one for each obstacle, see `unscented.points`."""
     known = np.flatnonzero(np.isfinite(seen.angle))
     if len(known) < len(seen.angle):
         log = np.zeros(len(seen.angle))
@@ -186,14 +187,14 @@ class MissEvidence(NamedTuple):
 
     @staticmethod
     def first(mixture: Mixture, silent: bool = False) -> MissEvidence:
-        """Of tracks that begin, with an echo or, out of memory, without."""
+        """Return that of tracks that begin, with an echo or, out of memory, without."""
         T = len(mixture.mu)
         return MissEvidence(np.ones(T), np.ones(T), np.zeros(T), np.full(T, silent), mixture)
 
     def predicted(
         self, filter_: DepthSlices, before: Sonar, after: Sonar, dt: float
     ) -> MissEvidence:
-        """As the sonar will see the obstacles `dt` seconds later."""
+        """Return it as the sonar will see the obstacles `dt` seconds later."""
         silent = np.flatnonzero(self.silent)
         if not len(silent):
             return self
@@ -203,8 +204,8 @@ class MissEvidence(NamedTuple):
     def with_ping(
         self, hit: BoolArray, mixture: Mixture, filter_: DepthSlices, sonar: Sonar, last: Sonar
     ) -> MissEvidence:
-        """With one more ping, which had an echo of the tracks where `hit` (T,); last: the sonar in
-        the ping before."""
+        """Return it with one more ping, which had an echo of the tracks where `hit` (T,); last:
+        the sonar in the ping before."""
         silent, fresh = np.flatnonzero(~hit), np.flatnonzero(~hit & ~self.silent)
         shown = filter_.apply_echo(mixture, sonar, sonar)
         if len(silent):

@@ -58,9 +58,9 @@ class Bodies(NamedTuple):
     def with_echoes(
         self, extended: BoolArray, z: FloatArray, R: FloatArray, own: FloatArray
     ) -> tuple[Bodies, FloatArray]:
-        """After one detection z (T, 2), R (T, 2, 2) for each, of which some are `extended` (T,);
-        and the covariance (T, 2, 2) to update with. own (2,): m^2 and rad^2, variances of a
-        detection that comes without."""
+        """Return the bodies after one detection z (T, 2), R (T, 2, 2) for each, of which some are
+        `extended` (T,); and the covariance (T, 2, 2) to update with. own (2,): m^2 and rad^2,
+        variances of a detection that comes without."""
         if not extended.any():
             return self, R
         metres = np.column_stack([np.ones(len(z)), z[:, 0]])

@@ -268,7 +268,7 @@ class ObstacleConfig(
         return std, std * WALKS
 
     def detection_at(self, distance: FloatArray) -> FloatArray:
-        """Probability that a ping shows obstacles at ranges (T,) in the beam."""
+        """Return the probability that a ping shows obstacles at ranges (T,) in the beam."""
         if not self.detection_profile:
             return np.full(len(distance), self.detection_probability)
         factor = np.interp(distance, self.detection_profile[::2], self.detection_profile[1::2])

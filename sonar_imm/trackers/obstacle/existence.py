@@ -88,7 +88,7 @@ class Existence(NamedTuple):
 
     def detectability(self, config: ObstacleConfig) -> FloatArray:
         """Return the share (T,) of pings that show each obstacle, at full detectability."""
-        seen = self.classes @ detection_classes(config)
+        seen = self.classes @ (config.detection_probability * CLASSES)
         return np.asarray(seen / np.maximum(self.probability(), 1e-300))
 
     def later(self, dt: float) -> Existence:
@@ -141,15 +141,9 @@ class Existence(NamedTuple):
         return np.where(confirmed, np.where(hit, CONFIRMED, COASTING), TENTATIVE).astype(np.uint8)
 
 
-def detection_classes(config: ObstacleConfig) -> FloatArray:
-    """Return the detection probability (C,) of each class."""
-    return config.detection_probability * CLASSES
-
-
 def detection(distance: FloatArray, config: ObstacleConfig) -> FloatArray:
     """Return the detection probability (T, C) of each class at ranges (T,)."""
-    share = config.detection_at(distance) / config.detection_probability
-    found = share[:, None] * detection_classes(config)
+    found = config.detection_at(distance)[:, None] * CLASSES
     return np.clip(found, LEAST_DETECTION, SUREST_DETECTION)
 
 

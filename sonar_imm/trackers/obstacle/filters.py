@@ -90,23 +90,26 @@ NOWHERE = np.full(3, np.nan)
 
 
 class Sonar(NamedTuple):
-    """The sonar during a ping: its pose at the transmission, the altitude above the sea floor (NaN
-    when unknown), and for two-way timing its pose `late_by` seconds later, None otherwise.
-    reference: how far below the navigation reference, whose altitude it is, the sonar lies, m.
-    course: (3,) m/s, velocity of the vehicle along its course, NaN when unknown. velocity: (3,)
-    m/s of the sonar now, NED; turn: (3,) rad/s, rate at which it turns, in its own axes."""
+    """The sonar during a ping."""
 
     pose: Pose
+    """At the transmission."""
     altitude: float = np.nan
+    """m above the sea floor, of the navigation reference; NaN when unknown."""
     late: Pose | None = None
+    """For two-way timing, `late_by` seconds later; None otherwise."""
     late_by: float = 0.0
     reference: float = 0.0
+    """m by which the sonar lies below the navigation reference."""
     course: Annotated[FloatArray, '3'] = NOWHERE
+    """(3,) m/s of the vehicle along its course, NED; NaN when unknown."""
     velocity: Annotated[FloatArray, '3'] = np.zeros(3)
+    """(3,) m/s of the sonar now, NED."""
     turn: Annotated[FloatArray, '3'] = np.zeros(3)
+    """(3,) rad/s at which it turns, in its own axes."""
 
     def seabed_below(self) -> float:
-        """Depth of the sea floor below the sonar, m, NaN when unknown."""
+        """Return the depth of the sea floor below the sonar, m, NaN when unknown."""
         return self.altitude - self.reference
 
 
@@ -178,7 +181,7 @@ class DepthSlices:
     def begin(
         self, z: FloatArray, R: FloatArray, sonar: Sonar, height: HeightPrior | None = None
     ) -> Mixture:
-        """New targets from detections z (B, 2), R (B, 2, 2)."""
+        """Return new targets from detections z (B, 2), R (B, 2, 2)."""
         B, K = len(z), self.K
         x, P = np.zeros((B, K, self.n)), np.zeros((B, K, self.n, self.n))
         x[..., :2] = z[:, None]
@@ -199,8 +202,8 @@ class DepthSlices:
     def advance(
         self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
-        """The targets as the sonar will see them `dt` seconds later, and how many covariances had
-        to be repaired."""
+        """Return the targets as the sonar will see them `dt` seconds later, and how many
+        covariances had to be repaired."""
         switched = self.switch_behaviours(mixture, dt)
         return self.predict_unchanged(switched, before, after, dt)
 
@@ -227,11 +230,11 @@ class DepthSlices:
         return joined([each for each, _ in done]), sum(repairs for _, repairs in done)
 
     def switch_behaviours(self, mixture: Mixture, dt: float) -> Mixture:
-        """The targets with what they may begin to do within `dt` seconds."""
+        """Return the targets with what they may begin to do within `dt` seconds."""
         return mixture
 
     def whereabouts(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
-        """Mean place (T, 3) in the world and velocity (T, 3) of the targets, NED."""
+        """Return the mean place (T, 3) in the world and velocity (T, 3) of the targets, NED."""
         m = unscented.points(mixture.x, *sonar.pose, self.cone)
         place = geometry.to_world(sonar.pose, np.einsum('tk,tka->ta', mixture.mu, m))
         velocity = np.zeros(place.shape)
@@ -257,8 +260,8 @@ class DepthSlices:
     def expected(
         self, mixture: Mixture, sonar: Sonar, met: Sequence[Sonar] | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Range and azimuth (T, K, 2) a detection would show, and their covariance (T, K, 2, 2)
-        without the sonar's own error; met: sonars that see one target each."""
+        """Return range and azimuth (T, K, 2) a detection would show, and their covariance (T, K,
+        2, 2) without the sonar's own error; met: sonars that see one target each."""
         if met and sonar.late is not None:
             seen = [self._echo(take(mixture, np.array([t])), own) for t, own in enumerate(met)]
             h = np.concatenate(seen)
@@ -269,34 +272,37 @@ class DepthSlices:
     def update(
         self, mixture: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
     ) -> tuple[Mixture, FloatArray, int]:
-        """After detections z (T, 2), R (T, 2, 2) of the targets, of which `h` was expected; their
-        log density (T,), and how many covariances had to be repaired."""
+        """Return the targets after detections z (T, 2), R (T, 2, 2) of the targets, of which `h`
+        was expected; their log density (T,), and how many covariances had to be repaired."""
         *after, log, repaired = mixtures.update(*mixture, h, z, R)
         return Mixture(*after), log, int(np.count_nonzero(repaired))
 
     def apply_echo(self, mixture: Mixture, sonar: Sonar, last: Sonar) -> Mixture:
-        """With what an echo in this ping says of the height, or one in the ping before, of the
-        sonar `last` (`beam`)."""
+        """Return the targets with what an echo in this ping says of the height, or one in the ping
+        before, of the sonar `last` (`beam`)."""
         m = unscented.points(mixture.x, *sonar.pose, self.cone)
         if last is not sonar:
             m = geometry.predict(m, sonar.pose, last.pose)
         other = np.full(len(m), DOUBT)
-        vertical, *others = self._beam
-        edge, soft = (1.0 + EDGE) * vertical, SOFT * vertical
-        beam = edge, soft, *others
-        return Mixture(*mixtures.weight_by_beam(*mixture, m, other, 1.0 - other, *beam)[:3])
+        return Mixture(*self._weighed(mixture, m, other, 1.0 - other, 1.0 + EDGE)[:3])
 
     def apply_miss(
         self, mixture: Mixture, p: FloatArray, sonar: Sonar
     ) -> tuple[Mixture, FloatArray]:
-        """After a ping without an echo of the targets, which each give one with the probability
-        p (T,) inside the beam; and the probability (T,) beforehand that the beam held them."""
+        """Return the targets after a ping without an echo of the targets, which each give one with
+        the probability p (T,) inside the beam; and the probability (T,) beforehand that the beam
+        held them."""
         m = unscented.points(mixture.x, *sonar.pose, self.cone)
-        vertical, *others = self._beam
-        edge, soft = (1.0 - EDGE) * vertical, SOFT * vertical
-        beam = edge, soft, *others
-        *after, inside = mixtures.weight_by_beam(*mixture, m, np.ones(len(p)), -p, *beam)
+        *after, inside = self._weighed(mixture, m, np.ones(len(p)), -p, 1.0 - EDGE)
         return Mixture(*after), inside
+
+    def _weighed(
+        self, mixture: Mixture, m: FloatArray, floor: FloatArray, slope: FloatArray, edge: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """See `mixtures.weight_by_beam`, with a beam `edge` times as high."""
+        vertical = self._beam.vertical
+        beam = self._beam._replace(vertical=edge * vertical)
+        return mixtures.weight_by_beam(*mixture, m, floor, slope, beam, SOFT * vertical)
 
     def view(self, mixture: Mixture, sonar: Sonar) -> View:
         """See `View`."""
@@ -321,21 +327,20 @@ class DepthSlices:
         )
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
-        """Probability of each behaviour, (T, B)."""
+        """Return the probability of each behaviour, (T, B)."""
         return np.ones((len(mu), 1))
 
     def visible(
         self, mixture: Mixture, pose: Pose, widest: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[FloatArray, BoolArray]:
-        """Probability (T, K, E) that the beam holds each component, by parts of its height, and
-        which targets (T,) lie ahead; pose: of the sonar, or of one for each target, see
-        `unscented.points`. widest: azimuth and range from which there were echoes, where these are
-        more than the parameters say."""
+        """Return the probability (T, K, E) that the beam holds each component, by parts of its
+        height, and which targets (T,) lie ahead; pose: of the sonar, or of one for each target,
+        see `unscented.points`. widest: azimuth and range from which there were echoes, where these
+        are more than the parameters say."""
         x, P, mu = mixture
         m = unscented.points(x, *pose, self.cone)
-        vertical, horizontal, reach = self._beam
-        edges = max(horizontal, widest[0]), max(reach, widest[1])
-        return mixtures.visible(m, P, mu, vertical, *edges)
+        sides = map(max, self._beam[1:], widest)
+        return mixtures.visible(m, P, mu, mixtures.Beam(self._beam.vertical, *sides))
 
     def _echo(self, mixture: Mixture, sonar: Sonar) -> FloatArray:
         """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo
@@ -464,8 +469,8 @@ class BehaviourSlices(DepthSlices):
 def depth_span(
     z: FloatArray, sonar: Sonar, config: ObstacleConfig, height: HeightPrior | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Smallest and largest vertical offset (B,) that detections z (B, 2) can have: inside the
-    beam, or where `height` says, below the surface, above the sea floor."""
+    """Return the smallest and largest vertical offset (B,) that detections z (B, 2) can have:
+    inside the beam, or where `height` says, below the surface, above the sea floor."""
     a, b, c = sonar.pose.R[2]
     d, delta = z.T
     k = a * np.cos(delta) + b * np.sin(delta)
@@ -500,9 +505,9 @@ def depth_span(
 
 
 def depth_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[FloatArray, FloatArray]:
-    """Centres (B, K) of K equal slices of the spans (B,), and half their width (B,). Slices above
-    and below the sonar are in pairs: on a level path they stay equally probable. For that they
-    reach out of the span by up to a quarter of a slice."""
+    """Return the centres (B, K) of K equal slices of the spans (B,), and half their width (B,).
+    Slices above and below the sonar are in pairs: on a level path they stay equally probable. For
+    that they reach out of the span by up to a quarter of a slice."""
     width = (highest - lowest) / K
     first = np.round((2.0 * lowest + width) / width) * 0.5 * width
     return first[:, None] + np.arange(K) * width[:, None], 0.5 * width
@@ -518,11 +523,11 @@ def two_way_echo(out: FloatArray, sonar: Sonar, config: ObstacleConfig) -> Float
     return np.stack([0.5 * (d_out + d_back), azimuth], axis=-1)
 
 
-def beam_of(config: ObstacleConfig) -> tuple[float, float, float]:
-    """Half height and half width, rad, and reach of the beam, m."""
+def beam_of(config: ObstacleConfig) -> mixtures.Beam:
+    """Return the beam of the parameters."""
     fov = config.vertical_fov_deg, config.horizontal_fov_deg
-    vertical, horizontal = np.radians(0.5 * np.array(fov))
-    return float(vertical), float(horizontal), config.max_range
+    vertical, horizontal = (math.radians(0.5 * angle) for angle in fov)
+    return mixtures.Beam(vertical, horizontal, config.max_range)
 
 
 def _cut_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[FloatArray, FloatArray]:
@@ -541,8 +546,9 @@ def build_filter(config: ObstacleConfig) -> DepthSlices:
 
 
 def moving_alike(filter_: DepthSlices, mixture: Mixture, confirmed: np.ndarray) -> bool:
-    """Whether most of the confirmed obstacles, three at least, move, and in the same way. Then it
-    is more probably the navigation that drifts: an error of its velocity moves all alike."""
+    """Return whether most of the confirmed obstacles, three at least, move, and in the same
+    way. Then it is more probably the navigation that drifts: an error of its velocity moves all
+    alike."""
     if np.count_nonzero(confirmed) < ALIKE_AT_LEAST or not filter_.moves.any():
         return False
     which = np.flatnonzero(confirmed)
@@ -567,7 +573,7 @@ def _velocity(
 
 
 def behaviour_columns(view: View, behaviours: tuple[str, ...]) -> dict[str, FloatArray]:
-    """``prob_<behaviour>``, and the velocity with its covariance, east then north (ENU)."""
+    """Return ``prob_<behaviour>``, and the velocity with its covariance, east then north (ENU)."""
     covariance = view.velocity_covariance
     return {
         **{f'prob_{name}': view.behaviour[:, i] for i, name in enumerate(behaviours)},

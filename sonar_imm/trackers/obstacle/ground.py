@@ -61,7 +61,7 @@ class Cells(NamedTuple):
         return Cells(whole, np.empty(0), np.empty(0), np.empty(0), whole)
 
     def joined(self, other: Cells) -> Cells:
-        """Both, added up where they have the same cell."""
+        """Return both, added up where they have the same cell."""
         key, place = np.unique(np.concatenate([self.key, other.key]), return_inverse=True)
 
         def summed(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -78,15 +78,15 @@ class Cells(NamedTuple):
         )
 
     def newest(self, count: int) -> Cells:
-        """At most `count` cells, those sounded last."""
+        """Return at most `count` cells, those sounded last."""
         if len(self.key) <= count:
             return self
         kept = np.sort(np.argsort(self.stamp_ns, kind='stable')[len(self.key) - count :])
         return Cells._make(part[kept] for part in self)
 
     def near(self, x: float, y: float, radius: float) -> FloatArray:
-        """Of the cells whose middle is within `radius` of x, y: (k, 4) how far east and north it
-        lies, height, variance."""
+        """Return, of the cells whose middle is within `radius` of x, y: (k, 4) how far east and
+        north it lies, height, variance."""
         i, j = self.key >> 32, (self.key & (_ROW - 1)) - (_ROW >> 1)
         east, north = CELL * (i + 0.5) - x, CELL * (j + 0.5) - y
         inside = np.flatnonzero(east * east + north * north <= radius * radius)
@@ -108,7 +108,7 @@ class GroundMap(NamedTuple):
     recent: Cells = Cells.none()
 
     def added(self, ground: Ground) -> GroundMap:
-        """With more soundings."""
+        """Return the map with more soundings."""
         x, y, z = ground.position.T
         i, j = np.floor(x / CELL).astype(np.int64), np.floor(y / CELL).astype(np.int64)
         one_each = Cells(
@@ -127,8 +127,8 @@ class GroundMap(NamedTuple):
         return bool(len(self.old.key) or len(self.recent.key))
 
     def floor(self, x: float, y: float, radius: float) -> tuple[float, float]:
-        """Height of the floor at x, y and its standard deviation, m; NaN where nothing was sounded
-        within `radius`."""
+        """Return the height of the floor at x, y and its standard deviation, m; NaN where nothing
+        was sounded within `radius`."""
         cells = np.concatenate([part.near(x, y, radius) for part in self])
         if not len(cells):
             return np.nan, np.nan
@@ -151,8 +151,8 @@ class GroundMap(NamedTuple):
     def below(
         self, z: FloatArray, sonar: Sonar, config: ObstacleConfig
     ) -> tuple[FloatArray, FloatArray]:
-        """How far below the sonar the floor is where detections z (B, 2) meet it, and its standard
-        deviation, (B,) m; NaN where nothing was sounded."""
+        """Return how far below the sonar the floor is where detections z (B, 2) meet it, and its
+        standard deviation, (B,) m; NaN where nothing was sounded."""
         depth, std = np.full(len(z), np.nan), np.full(len(z), np.nan)
         flat = sonar.seabed_below()
         for k, (d, azimuth) in enumerate(z.tolist()):

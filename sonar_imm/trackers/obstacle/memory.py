@@ -48,31 +48,33 @@ beyond 78."""
 
 
 class Landmark(NamedTuple):
-    """An obstacle that is not in view, as it was at `stamp_ns`, when its track ended.
-
-    seen_ns: last echo; classes (C,): its existence by class of detectability (`existence`), at
-    that time; sonar: pose then, NED and FRD; which (k,): the
-    components that are kept, of the filter's, with their x (k, n), P (k, n, n) and weights mu
-    (k,); body: number of echoes with an extent, and their standard deviations (2,) m; place (3,)
-    m, covariance (3, 3) and low, high, the 90 % band of its height, all in the world, ENU."""
+    """An obstacle that is not in view, as it was when its track ended."""
 
     track_id: int
     stamp_ns: int
+    """When its track ended."""
     seen_ns: int
+    """Its last echo."""
     classes: Annotated[FloatArray, 'C']
+    """(C,) existence by class of detectability (`existence`)."""
     sonar: Pose
+    """NED and FRD."""
     which: Annotated[np.ndarray, 'k']
+    """(k,) the components that are kept, of the filter's."""
     x: Annotated[FloatArray, 'kn']
     P: Annotated[FloatArray, 'knn']
     mu: Annotated[FloatArray, 'k']
     body: tuple[float, FloatArray]
+    """Number of echoes with an extent, and their standard deviations (2,) m."""
     place: Annotated[FloatArray, '3']
+    """(3,) m, ENU, with its covariance (3, 3)."""
     covariance: Annotated[FloatArray, '33']
     low: float
+    """m, 90 % band of its height, up to `high`."""
     high: float
 
     def mixture(self, K: int) -> Mixture:
-        """The components as a mixture of one obstacle with `K`."""
+        """Return the components as a mixture of one obstacle with `K`."""
         n = self.x.shape[1]
         x, P = np.zeros((1, K, n)), np.tile(np.eye(n), (1, K, 1, 1))
         mu = np.zeros((1, K))
@@ -81,20 +83,21 @@ class Landmark(NamedTuple):
         return Mixture(x, P, mu)
 
     def existence(self, stamp_ns: int, landmark_time: float) -> float:
-        """The probability that it is still there at `stamp_ns`."""
+        """Return the probability that it is still there at `stamp_ns`."""
         age = max(stamp_ns - self.stamp_ns, 0) * 1e-9
         return float(self.classes.sum()) * math.exp(-age / landmark_time)
 
     def spread(self, stamp_ns: int, config: ObstacleConfig) -> FloatArray:
-        """Covariance (3, 3) of its place at `stamp_ns`, ENU, with what navigation drifted."""
+        """Return the covariance (3, 3) of its place at `stamp_ns`, ENU, with what navigation
+        drifted."""
         age = max(stamp_ns - self.stamp_ns, 0) * 1e-9
         position, _, depth = config.drift()
         drift = np.square([position, position, depth])
         return self.covariance + np.diag(drift * age)
 
     def row(self, stamp_ns: int, config: ObstacleConfig) -> dict[str, float]:
-        """As plain values: where it is at `stamp_ns`, ENU, m, with covariance and the band of its
-        height, and the probability that it is there."""
+        """Return it as plain values: where it is at `stamp_ns`, ENU, m, with covariance and the
+        band of its height, and the probability that it is there."""
         spread = self.spread(stamp_ns, config)
         return {
             'track_id': self.track_id,
@@ -115,7 +118,7 @@ Memory = tuple[Landmark, ...]
 
 
 def kept(memory: Memory, stamp_ns: int, config: ObstacleConfig) -> Memory:
-    """At most `max_landmarks`: those that are most probably still there. None is newer than
+    """Return at most `max_landmarks`: those that are most probably still there. None is newer than
     `stamp_ns`: across a clock that went back nothing is known of the drift."""
     memory = tuple(each for each in memory if each.stamp_ns <= stamp_ns)
     if len(memory) <= config.max_landmarks:

@@ -16,6 +16,7 @@ targets at once. A component of weight 0 is dropped: it takes no further part.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr, ndtri
@@ -287,27 +288,30 @@ def innovations(
 # -- the beam ------------------------------------------------------------------------------------
 
 
+class Beam(NamedTuple):
+    """Half height and half width of the beam, rad, and its reach, m."""
+
+    vertical: float
+    horizontal: float
+    reach: float
+
+
 def visible(
-    m: FloatArray,
-    P: FloatArray,
-    mu: FloatArray,
-    vertical: float,
-    horizontal: float,
-    reach: float,
+    m: FloatArray, P: FloatArray, mu: FloatArray, beam: Beam
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the probability (T, K, E) that a beam of these half widths and that reach holds the
-    `PARTS` by height of components at m (T, K, 3), seen from the sonar, with covariances P (T, K,
-    n, n), at least `UNSEEN`; and whether (T,) the targets lie `AHEAD`."""
+    """Return the probability (T, K, E) that a beam holds the `PARTS` by height of components at m
+    (T, K, 3), seen from the sonar, with covariances P (T, K, n, n), at least `UNSEEN`; and whether
+    (T,) the targets lie `AHEAD`."""
     x, y, z = np.moveaxis(m, -1, 0)
     d = np.sqrt(x * x + y * y + z * z)
     smear = SMEAR * SMEAR
     up, side = np.arcsin(z / d), np.arctan2(np.abs(y), x)
     std = np.sqrt(smear + P[..., 2, 2] / (d * d))
-    above, below = ((edge - up) / std for edge in (vertical, -vertical))
+    above, below = ((edge - up) / std for edge in (beam.vertical, -beam.vertical))
     above, below = (edge[..., None] - PART for edge in (above, below))
     inside = ndtr(above / WITHIN) - ndtr(below / WITHIN)
-    level = ndtr((horizontal - side) / np.sqrt(smear + P[..., 1, 1]))
-    level *= ndtr((reach - d) / np.sqrt(smear * reach * reach + P[..., 0, 0]))
+    level = ndtr((beam.horizontal - side) / np.sqrt(smear + P[..., 1, 1]))
+    level *= ndtr((beam.reach - d) / np.sqrt(smear * beam.reach**2 + P[..., 0, 0]))
     inside *= level[..., None]
     mean = np.einsum('tk,tka->ta', mu, m)
     ahead = mean[:, 0] > AHEAD * np.sqrt((mean * mean).sum(axis=1))
@@ -321,26 +325,23 @@ def weight_by_beam(
     m: FloatArray,
     floor: FloatArray,
     slope: FloatArray,
-    edge: float,
+    beam: Beam,
     soft: float,
-    horizontal: float,
-    reach: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the density of mixtures (T, K) times `floor + slope B`, moment-matched component by
     component, and the mean (T,) of B beforehand (`beam`).
 
-    m (T, K, 3): where the means lie, seen from the sonar; floor, slope (T,); edge and soft, rad:
-    half height of the pattern B and the standard deviation of its edges; horizontal, reach: half
-    width of the sector, rad, and its range, m, which fade out likewise.
+    m (T, K, 3): where the means lie, seen from the sonar; floor, slope (T,); beam: of the pattern
+    B, and soft, rad, the standard deviation of its edges. Sector and reach fade out likewise.
     """
     X, Y, Z = np.moveaxis(m, -1, 0)
     d = np.sqrt(X * X + Y * Y + Z * Z)
-    off = horizontal - np.arctan2(np.abs(Y), X)
+    off = beam.horizontal - np.arctan2(np.abs(Y), X)
     share = np.clip(0.5 + 0.25 * off / soft, 0.0, 1.0)
-    share *= np.clip(0.5 + 0.25 * (reach / d - 1.0) / soft, 0.0, 1.0)
+    share *= np.clip(0.5 + 0.25 * (beam.reach / d - 1.0) / soft, 0.0, 1.0)
     std = np.sqrt(soft * soft + P[..., 2, 2] / (d * d))
     elevation, rate = np.arcsin(Z / d), 1.0 / (std * d)
-    above, below = (edge - elevation) / std, (-edge - elevation) / std
+    above, below = (beam.vertical - elevation) / std, (-beam.vertical - elevation) / std
     upper, lower = (np.exp(-0.5 * side * side) / ROOT_2PI for side in (above, below))
     inside = share * (ndtr(above) - ndtr(below))
     first = share * rate * (lower - upper)

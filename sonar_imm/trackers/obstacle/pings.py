@@ -58,13 +58,13 @@ class Mount:
         self.R = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
 
     def sonar(self, vehicle: Pose) -> Pose:
-        """The sonar in NED and FRD, from a vehicle in ENU and FLU."""
+        """Return the sonar in NED and FRD, from a vehicle in ENU and FLU."""
         there = geometry.mounted(vehicle, self.lever, self.R)
         return Pose(geometry.flip_world(there.position), geometry.flip_rotation(there.R))
 
     @staticmethod
     def to_enu(points: FloatArray, covariance: FloatArray) -> tuple[FloatArray, ...]:
-        """Points (T, 3) and covariances (T, 3, 3) in ENU, from NED."""
+        """Return points (T, 3) and covariances (T, 3, 3) in ENU, from NED."""
         return geometry.flip_world(points), geometry.flip_covariance(covariance)
 
 
@@ -187,8 +187,8 @@ class Sweep:
         return cls(echoes.z[order, 1], echoes.late[order], at)
 
     def met(self, place: FloatArray, velocity: FloatArray, since: float) -> Met:
-        """When the beam met obstacles at the places (T, 3) that move with velocity (T, 3), NED,
-        the stamp being `since` s later than that; not earlier than then."""
+        """Return when the beam met obstacles at the places (T, 3) that move with velocity (T, 3),
+        NED, the stamp being `since` s later than that; not earlier than then."""
         ago = np.zeros(len(place))
         for i in range(len(place)):
             late = 0.0

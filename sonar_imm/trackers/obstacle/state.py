@@ -45,42 +45,50 @@ RULES = TrackRules(confirm_hits=2, confirm_window=2, delete_misses=1, max_coast_
 
 
 class Obstacles(NamedTuple):
-    """T obstacles in view: mixture over depth and behaviour; nis (T,), NaN without an echo;
-    bodies: how far their echoes wander; misses: pings that did not show them, and what that says;
-    existence: how sure it is that they are there; last (T, 2): their newest innovation in range
-    and bearing, in standard deviations, NaN without an echo in the newest ping."""
+    """T obstacles in view."""
 
     mixture: Mixture
+    """Over depth and behaviour."""
     nis: Annotated[FloatArray, 'T']
+    """(T,) of the newest echo; NaN without one in the newest ping."""
     bodies: Bodies
+    """How far their echoes wander."""
     misses: MissEvidence
+    """Pings that did not show them, and what that says of their height."""
     existence: Existence
+    """How sure it is that they are there."""
     last: Annotated[FloatArray, 'T2']
+    """(T, 2) innovation in range and bearing, in standard deviations; NaN as `nis`."""
 
 
 class Known(NamedTuple):
-    """What is known after a ping: the obstacles in view and their tracks, `life`; memory: those
-    that are not in view any more; repairs: covariances repaired so far; broken: tracks ended so
-    far because their numbers were not finite; alike: whether most obstacles move alike
-    (`filters.moving_alike`), pings_alike: pings so far in which they did; innovations: of
-    confirmed obstacles; seeds: echoes that may become tracks; clutter: false echoes so far;
-    scales: of the variances of the echoes; untimed: s that the pings took that are the most wrong
-    for it, and m by which they are, where their echoes have no times; navigation: its errors."""
+    """What is known after a ping."""
 
     stamp_ns: int
+    """0 before the first one."""
     sonar: Sonar
     life: Tracks
+    """Of the obstacles in view."""
     obstacles: Obstacles
     memory: Memory = ()
+    """Obstacles that are not in view any more."""
     repairs: int = 0
+    """Number of covariances repaired so far."""
     broken: int = 0
+    """Number of tracks ended so far because their numbers were not finite."""
     alike: bool = False
+    """Whether most obstacles move alike (`filters.moving_alike`)."""
     pings_alike: int = 0
+    """Number of pings so far in which they did."""
     innovations: NisMemory = NisMemory()
+    """Of confirmed obstacles."""
     seeds: SeedBatches = ()
+    """Echoes that may become tracks."""
     clutter: Clutter = Clutter.none()
     scales: Scales = Scales.none()
+    """Of the variances of the echoes."""
     untimed: tuple[float, float] = (0.0, 0.0)
+    """Of the ping without times that is the most wrong for it: s that it took, m of the error."""
     navigation: NavigationErrors = NavigationErrors(np.zeros(5), np.zeros((5, 5)))
 
     @classmethod

@@ -194,7 +194,7 @@ class ObstacleTracker:
         }
 
     def warnings(self) -> list[str]:
-        """What users should know of the echoes, in sentences."""
+        """Return what users should know of the echoes, in sentences."""
         known, config = self._stream.state.known, self.config
         advice = 'check range_std, bearing_std_deg and the variances of the detections'
         found = known.scales.warnings(config) + known.clutter.warnings(config)

@@ -18,6 +18,7 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 from sonar_imm.soundings import SIDES
+from sonar_imm.trackers.bathymetry.terrain import KINDS
 
 from ..columns import read_columns
 
@@ -118,11 +119,12 @@ def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None)
 
 
 def rough_models(names: tuple[str, ...]) -> BoolArray:
-    """Which models (M,) mean rough floor. Beside a constant slope it is the random walk, beside
-    `steady` floor what scatters or walks, in a bank, whose noise grows from model to model, the
-    upper half. A single model never does."""
+    """Return which models (M,) mean rough floor. Beside a constant slope it is the random walk,
+    beside `steady` floor the rough `KINDS` and what scatters or walks; in a bank, whose noise
+    grows from model to model, the upper half. A single model never does."""
     if 'steady' in names:
-        return np.array([name.startswith(('scatter', 'rw', 'walk')) for name in names])
+        known = {kind.name for kind in KINDS if kind.rough}
+        return np.array([name in known or name.startswith(('scatter', 'rw')) for name in names])
     if 'ncs' in names:
         return np.array([name == 'rw' for name in names])
     rough = np.arange(len(names)) >= len(names) // 2

@@ -8,16 +8,19 @@
 
 """What the diver tracker predicts of each fix, for `evaluation.tuning`.
 
-A scan of m fixes, of which false ones and new divers come with density l = clutter_density + b
-over the area A in which fixes lie at all, with b birth_density times the time since the scan
-before, has
+Fixes that are false or of new divers come with density l = clutter_density + b, b birth_density
+times the time since the scan before. With the probability p that a diver is seen, the density f_td
+of fix d as one of track t under the whole mixture of the track, and the probability r_t that the
+track is a diver, a scan of m fixes over the area A in which fixes lie at all has
 
-    log p = m log l - l A + sum_t log(1 - r p + r p f / l)
+    log p = m log l - l A + log sum_events prod_assigned r_t p f_td / l prod_missed (1 - r_t p)
 
-over the tracks: r the probability that a track is a diver, p that he is seen, f the density of the
-fix that is his under the whole mixture, 0 where he has none. So a missed diver costs
-log(1 - r p), a refused fix log l, and losing a track never pays. r begins at b / l
-and follows from the same terms. Where fixes come singly, r is 1 and nobody is missed.
+over the joint events, in which each fix belongs to one track at most (`marginals.log_total`): two
+tracks of one diver do not count his fixes twice. A missed diver costs log(1 - r p), and losing a
+track never pays. r begins at b / l and follows from the same events. A fix that comes singly and
+without a name is of one of the tracks, in proportion to r, and nobody is missed,
+
+    log p = log((1 - p) l + p sum_t r_t f_t / sum_t r_t).
 """
 
 from __future__ import annotations
@@ -29,19 +32,31 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
+from sonar_imm.estimation import jipda
+from sonar_imm.estimation.marginals import log_total
 from sonar_imm.measurements import Arrivals, Fix, Fixes, NOBODY
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig, MODEL_SETS
 from sonar_imm.trackers.diver.known import Known
+from sonar_imm.trackers.diver.pairing import gate_pairs, MIN_DETECTION_PROBABILITY
 from sonar_imm.trackers.diver.scan import Group
 from sonar_imm.trackers.diver.tracker import DiverTracker
 
 from ..tuning import Scores, Tunable
 
+WIDEST_GATE = 0.9999999
+"""Where a gate begins to refuse a fix the likelihood jumps, and its curvature says nothing about
+the scale of covariances."""
+
 
 def for_tuning(config: DiverConfig) -> DiverConfig:
     """One copy: the scale is what is fitted. One density of false fixes, that it can be too."""
-    return evolve(config, covariance_scales=(1.0,), clutter_density=config.usual_clutter)
+    return evolve(
+        config,
+        covariance_scales=(1.0,),
+        clutter_density=config.usual_clutter,
+        gate_probability=WIDEST_GATE,
+    )
 
 
 def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
@@ -109,35 +124,38 @@ class Scored(DiverTracker):
         return known
 
     def _score(self, known: Known, group: Group) -> tuple[float, int]:
-        config, found, seen = group.config, group.association, group.detection
-        assert found is not None and group.pairs is not None
-        p, m = config.detection_probability, len(group.z)
-        density = config.clutter_density + group.new_targets
-        tracks = np.flatnonzero(found.hit)
-        fix = found.fix[tracks]
-        log_f = np.full(len(known), -np.inf)
-        log_f[tracks] = group.pairs.track_log[tracks, fix]
-        score = m * math.log(density)
-        nameless = group.is_complete and group.target_id is None
-        if nameless:
-            score -= density * self.area
-        sure = config.max_tracks == 1
-        if seen is not None:
-            log_f[tracks] += np.log(seen.fixes[fix] / seen.tracks[tracks])
-        for track, track_id in enumerate(known.life.track_id.tolist()):
-            hit = np.isfinite(log_f[track])
-            ratio = math.exp(min(log_f[track] - math.log(density), 600.0)) if hit else 0.0
-            if not nameless or known['target_id'][track] != NOBODY:
-                if hit:
-                    score += math.log(1.0 - p + p * ratio)
-                continue
-            r = 1.0 if sure else self.existence.get(track_id, group.new_targets / density)
-            p = p if seen is None else float(seen.tracks[track])
-            total = 1.0 - r * p + r * p * ratio
-            score += math.log(total)
-            self.existence[track_id] = r * (1.0 - p + p * ratio) / total
+        config, found, pairs = group.config, group.association, group.pairs
+        assert found is not None and pairs is not None
+        T, m = pairs.track_log.shape
         # A fix that nothing came before cannot be predicted.
-        return score, m if len(known) else 0
+        count = m if T else 0
+        density = config.clutter_density + group.new_targets
+        score = m * math.log(density)
+        may = gate_pairs(group, pairs) | (pairs.direct < 1.0)
+        log_ratio = np.where(may, pairs.track_log, -np.inf) - math.log(density)
+        p = np.full(T, config.detection_probability)
+        if group.detection is not None:
+            p = np.maximum(group.detection.tracks, MIN_DETECTION_PROBABILITY)
+            log_ratio += np.log(group.detection.fixes / p[:, None])
+        ratio = np.exp(np.minimum(log_ratio, 600.0))
+        if group.target_id is not None:
+            own = np.flatnonzero(found.hit)
+            gained = np.log(1.0 - p[own] + p[own] * ratio[own, found.fix[own]])
+            return score + float(gained.sum()), count
+        if not group.is_complete:
+            r = np.nan_to_num(known['existence'], nan=1.0)
+            share = p * r / r.sum() if r.sum() > 0.0 else np.zeros(T)
+            return score + float(np.log(1.0 - share.sum() + share @ ratio).sum()), count
+        # A name says that a track is a diver, and one without a fix may have come under his name.
+        named = known['target_id'] != NOBODY
+        ids, begun = known.life.track_id.tolist(), group.new_targets / density
+        r = np.array([self.existence.get(track_id, begun) for track_id in ids])
+        r = np.where(named | (config.max_tracks == 1), 1.0, r)
+        p = np.where(named & ~may.any(axis=1), 0.0, p)
+        score += log_total((r * p)[:, None] * ratio, 1.0 - r * p, may) - density * self.area
+        _, _, after = jipda.associate(ratio, may, r, p)
+        self.existence.update(zip(ids, after.tolist()))
+        return score, count
 
 
 def area_of(measurements: Sequence[Any]) -> float:

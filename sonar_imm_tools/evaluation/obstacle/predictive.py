@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What the obstacle tracker predicts of each ping, for `evaluation.tuning`: the sum of
+"""What the obstacle tracker predicts of each ping, for `evaluation.tuning`: as
 `evaluation.diver.predictive`, in range and bearing over the sector that the sonar sees, of tracks
 as far as they are in the beam, each with its own existence.
 """
@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from sonar_imm.estimation.marginals import log_total
 from sonar_imm.measurements import Detections
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.events import detected, ratios
@@ -69,9 +70,6 @@ class Scored(ObstacleTracker):
         visible = table.existence.visible(table.mixture.mu, match.compared.visible)
         seen, missed = every.sum(axis=1), 1.0 - (every * visible).sum(axis=1)
         g = ratios(match.compared, match.density, len(seen))
-        own = np.zeros(len(seen))
-        hit = np.flatnonzero(match.hit)
-        own[hit] = g[hit, match.compared.echo[match.pair[hit]]]
-        score += float(np.log(missed + seen * own).sum())
+        score += log_total(seen[:, None] * g, missed, g > 0.0)
         self.scores[ping.stamp_ns] = score, len(ping.echoes) if len(seen) else 0
         return known

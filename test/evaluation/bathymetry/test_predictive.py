@@ -14,7 +14,7 @@ import pytest
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig, MODEL_SETS
 from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
-from sonar_imm_tools.evaluation.bathymetry.predictive import for_tuning, Scored
+from sonar_imm_tools.evaluation.bathymetry.predictive import for_tuning, Scored, tunables
 
 
 def test_of_a_long_recording_sixteen_pings_from_begin_to_end_are_scored():
@@ -34,3 +34,11 @@ def test_tuning_is_without_monte_carlo_noise_where_the_models_have_a_grid(model_
     assert config.engine == engines.get(model_set, 'grid')
     assert config.smoothing == 'none'
     BathymetryTracker(config)  # it can be run
+
+
+@pytest.mark.parametrize('model_set', MODEL_SETS)
+def test_the_noise_of_its_own_models_is_tuned(model_set):
+    config = BathymetryConfig(model_set=model_set)
+    names = {found.name for found in tunables(config, [])}
+    noise = 'sigmas_deg' if model_set == 'angle_two_rw' else 'sigmas'
+    assert names == (set() if config.is_terrain else {noise, 'stay_probability'})

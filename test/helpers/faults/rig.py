@@ -135,6 +135,8 @@ class Rig:
 
     def _start(self, arguments: list[str]) -> None:
         case, enter = self.case, self._stack.enter_context
+        if self._lossless:
+            arguments += ['-p', 'max_wait:=0.0']
         topics = dict.fromkeys(message.topic for message in case.messages())
         for name in (*(topics if self._lossless else ()), f'{case.system}/estimate'):
             end = 'publisher' if name.endswith('estimate') else 'subscription'

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import Snapshot
-from sonar_imm.trackers.bathymetry.ping import LoudBins
+from sonar_imm.trackers.bathymetry.findings import LoudBins
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 

@@ -18,12 +18,8 @@ import pytest
 
 from sonar_imm.acoustics.coherence import common_mode
 from sonar_imm.measurements import Snapshot
-from sonar_imm.trackers.bathymetry.ping import residual_ratio
-from sonar_imm.trackers.bathymetry.tracker import (
-    BathymetryConfig,
-    BathymetryTracker,
-    noise_warnings,
-)
+from sonar_imm.trackers.bathymetry.findings import noise_warnings, residual_ratio
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.simulation.bathymetry import simulator as swath

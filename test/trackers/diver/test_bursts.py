@@ -255,6 +255,18 @@ def test_a_burst_that_follows_another_one_takes_no_identity():
     assert all(confirmed(each)[0] == ids for each in made[40:])
 
 
+def test_two_false_fixes_that_agree_are_not_said():
+    t = np.arange(60.0)
+    truth = np.column_stack([0.5 * t - 20.0, 0.0 * t])[:, None]
+    for fixes_off, said in ((2, False), (5, True)):
+        seen = truth.copy()
+        seen[40 : 40 + fixes_off, 0] += [15.0, -20.0]
+        tracker = DiverTracker(DiverConfig())
+        for scan in scans(seen, seed=5):
+            tracker.process(scan)
+        assert any('taken for bursts' in each for each in tracker.warnings()) == said
+
+
 def test_a_new_diver_beside_one_who_is_missed_is_no_burst():
     t = np.arange(80.0)
     first = np.column_stack([0.5 * t - 20.0, 0.0 * t])

@@ -104,6 +104,17 @@ def test_too_many_are_counted_and_said():
     ]
 
 
+def test_names_without_end_are_counted_and_said():
+    """Each fix has a name of its own: a driver that numbers its fixes, not its targets."""
+    tracker, last = run(
+        [fix(1 + 0.01 * k, 100.0 * k, name=k + 1) for k in range(30)], max_tracks=3
+    )
+    assert len(last) == 25
+    assert tracker.health()['names_without_track'] == 5
+    (sentence,) = tracker.warnings()
+    assert sentence.startswith('5 positions with a name of their own started no track')
+
+
 def test_a_start_is_no_missed_detection():
     walk = [fix(k, 0.0) for k in range(1, 8)]
     _, after = run([*walk, *(start(7.5 + 0.01 * k, 500.0 + 50.0 * k) for k in range(12))])

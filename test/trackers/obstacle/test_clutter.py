@@ -38,7 +38,7 @@ from sonar_imm.trackers.obstacle.existence import (
 )
 from sonar_imm.trackers.obstacle.filters import Sonar
 from sonar_imm.trackers.obstacle.ground import GroundMap
-from sonar_imm.trackers.obstacle.mixtures import PARTS, visible
+from sonar_imm.trackers.obstacle.mixtures import Beam, PARTS, visible
 from sonar_imm.trackers.obstacle.pings import Echoes, Ping
 from sonar_imm.trackers.obstacle.scales import Scales
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
@@ -145,7 +145,7 @@ def test_the_parts_of_a_component_are_those_of_a_normal_distribution():
     m = np.column_stack([np.full(37, 50.0), np.zeros(37), z])[None]
     P = np.tile(np.diag([0.01, 1e-6, 4.0]), (1, 37, 1, 1))
     edge = np.radians(7.5)
-    V, _ = visible(m, P, np.full((1, 37), 1.0 / 37.0), edge, 1.0, 1000.0)
+    V, _ = visible(m, P, np.full((1, 37), 1.0 / 37.0), Beam(edge, 1.0, 1000.0))
     d = np.hypot(50.0, z)
     std, up = np.hypot(np.radians(1.2), 2.0 / d), np.arcsin(z / d)
     whole = norm.cdf((edge - up) / std) - norm.cdf((-edge - up) / std)

@@ -17,6 +17,8 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from benchmarks.obstacle_accuracy import LEVER
+from benchmarks.obstacle_clutter import encounter
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.obstacle import mixtures, navigation_errors, unscented
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
@@ -280,6 +282,23 @@ def test_a_drift_is_no_motion_of_the_obstacle_and_is_said():
     off = dived(drift=drift, drift_std=0.0, yaw_error_std_deg=0.0, navigation_delay_std=0.0)
     assert off[0].health()['nav_drift_x'] == 0.0
     assert fixed(off[1]) < 0.1
+
+
+@pytest.mark.parametrize(
+    'name, seed', [('moving .1-.3 m/s', 400), ('moving .1-.3 m/s, 3 fixed', 403)]
+)
+def test_what_moves_slowly_is_no_drift(name, seed):
+    """At 0.16 m/s alone and at 0.12 m/s beside three obstacles that stay; halfway and at the
+    end."""
+    given, obstacles = encounter(name, seed)
+    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=LEVER['sonar_lever']))
+    final = list(run(tracker, given).values())
+    for ping in (60, 100):
+        extras, place = final[ping].extras, final[ping].xyz[:, :2]
+        for does, truth in obstacles:
+            row = np.linalg.norm(place - truth.position[ping, :2], axis=1).argmin()
+            assert extras['track_state'][row] > 0 and extras[f'prob_{does}'][row] > 0.9
+    assert tracker.warnings() == []
 
 
 @pytest.mark.parametrize('side, yaw_deg', [('starboard', 2.5), ('port', -2.5)])

@@ -6,12 +6,13 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Two sensors that report as one, a constant vector apart."""
+"""Two sensors that disagree, by name or as one."""
 
 from helpers.diver_runs import fix
 import numpy as np
 import pytest
 
+from benchmarks.diver_field import fixes_of, SINGLE
 from sonar_imm.trackers.diver.disagreement import two_places
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
@@ -79,6 +80,31 @@ def test_a_place_without_fixes_is_given_up():
     assert made[-1].covariance[0, 1, 1] < 1.0
     assert np.hypot(*(made[-1].state[0, :2] - way(99.0))) < 1.5
     assert not tracker.warnings()
+
+
+@pytest.mark.parametrize(
+    'scene, seed, due',
+    [
+        ('diver, b 3 m off', 602, '3 m apart'),
+        ('rov, b 3 m off', 600, '3 m apart'),
+        ('boat, b 2 s late', 600, '2 s late'),
+        ('boat, two sensors', 600, ''),
+    ],
+)
+def test_an_offset_or_a_delay_is_said_and_nothing_else(scene, seed, due):
+    items, truth = fixes_of(SINGLE[scene], seed)
+    tracker, nees = DiverTracker(DiverConfig(target=SINGLE[scene].target, max_tracks=1)), []
+    for item, place in zip(items[:140], truth):
+        last = tracker.process(item)[-1]
+        if len(last.state):
+            error = last.state[0, :2] - place
+            nees.append(error @ np.linalg.solve(last.covariance[0, :2, :2], error))
+    assert np.mean(nees[50:]) < 4.0
+    said = tracker.warnings()
+    assert len(said) == bool(due) and all(due in text for text in said)
+    # Scales that stood for the offset at first are left.
+    rows = tracker._stream.state.rows
+    assert (rows.key['scale'][rows.logw.argmax(), :2] == 1.0).all()
 
 
 def test_one_place_is_not_two():

@@ -1,0 +1,60 @@
+# Copyright 2026 The sonar_imm developers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+
+"""Positions and headings of which a single number is not finite."""
+
+import numpy as np
+import pytest
+
+from sonar_imm.measurements import (
+    Fix,
+    GeodeticFix,
+    Navigation,
+    Rejection,
+    RelativeFix,
+    Start,
+    VesselHeading,
+    VesselPose,
+)
+
+WHOLE = {
+    Fix: {'position': (1.0, 2.0, 3.0)},
+    GeodeticFix: {'latitude': 54.0, 'longitude': 10.0},
+    RelativeFix: {'offset': (1.0, 2.0, 3.0)},
+    Navigation: {'position': (1.0, 2.0, 3.0), 'orientation': (0.0, 0.0, 0.0, 1.0)},
+    Start: {'position': (1.0, 2.0, 3.0), 'covariance': np.eye(3)},
+    VesselHeading: {'orientation': (0.0, 0.0, 0.0, 1.0)},
+    VesselPose: {'position': (1.0, 2.0, 3.0), 'orientation': (0.0, 0.0, 0.0, 1.0)},
+}
+"""What each class needs besides its stamp."""
+
+
+def one_spoilt(values):
+    """The same values, one number of them not finite; each in turn."""
+    for name, value in values.items():
+        for index in np.ndindex(np.shape(value)):
+            for bad in (np.nan, np.inf):
+                spoilt = np.array(value, float)
+                spoilt[index] = bad
+                yield {**values, name: spoilt if spoilt.shape else float(spoilt)}
+
+
+@pytest.mark.parametrize('kind', WHOLE)
+def test_a_single_number_that_is_not_finite_is_refused(kind):
+    assert kind(stamp_ns=1, **WHOLE[kind]).stamp_ns == 1
+    # A z that is not measured may be NaN.
+    asked = [each for each in one_spoilt(WHOLE[kind]) if not _is_depth(kind, each)]
+    assert len(asked) >= 4
+    for values in asked:
+        with pytest.raises(Rejection):
+            kind(stamp_ns=1, **values)
+
+
+def _is_depth(kind, values):
+    covariance = values.get('covariance', np.eye(2))[:2, :2]
+    return kind in (Fix, Start) and np.isfinite([*values['position'][:2], *covariance.flat]).all()
