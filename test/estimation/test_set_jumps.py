@@ -15,7 +15,7 @@ from oracles.set_jumps import exact
 import pytest
 
 from sonar_imm.estimation.set_filter import LagSmoother, SetFilter
-from sonar_imm.estimation.set_model import SetModel
+from sonar_imm.estimation.set_model import SetModel, Walks
 from sonar_imm.estimation.set_shifts import Jump, Shift
 
 CELLS, JUMP_AT = 11, 3
@@ -118,3 +118,16 @@ def test_what_is_smoothed_jumped_when_it_did(model, records):
             assert places.sum() <= 2.0 + 1e-9
     # The first that comes out is record 0.
     assert int(np.argmax(found)) == JUMP_AT
+
+
+@pytest.mark.parametrize('centre', [CELLS, -3 * CELLS, 8])
+def test_walks_that_lead_off_the_lattice_leave_numbers(model, records, centre):
+    """As of a slope that is steep at the end of the lattice, wherever a jump leads before."""
+    tracker, probability = SetFilter(model, 300), np.array([[0.2, 0.6, 0.2]])
+    walks = Walks(np.zeros(CELLS, np.int64), np.array([centre]), probability, True)
+    before = cycle(tracker, None, records[0], (1, 0)).after
+    sets = tracker.propagate(before, tracker.record(records[1], (1, 1), walks=walks))
+    assert not np.isnan(sets.log_weight).any()
+    # Of nothing and of those that all died the births are left.
+    assert np.isfinite(sets.log_weight).any()
+    assert ((sets.sets.cell >= 0) & (sets.sets.cell < CELLS)).all()

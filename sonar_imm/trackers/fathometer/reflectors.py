@@ -236,6 +236,18 @@ class Identities:
         waited = (known._replace(absent=known.absent + records) for known in self.reflectors)
         return evolve(self, reflectors=tuple(waited))
 
+    def offset(self, depth: FloatArray, most: float, within: float) -> float:
+        """By how much those of the next record at `depth` (K,) all lie elsewhere, m, `most` at
+        most: the offset that brings most of them within `within` of these here, and near to it;
+        0 where that is one only."""
+        ways = depth[:, None] - np.array([each.place for each in self.reflectors])
+        offsets = np.append(0.0, ways[np.abs(ways) <= most])
+        off = np.abs(ways[..., None] - offsets).min(axis=1, initial=np.inf) / within
+        near = np.maximum(1.0 - np.square(off), 0.0)
+        # Of those that are as good, the least.
+        best = int(np.argmax(near.sum(axis=0) - 0.5 * np.abs(offsets) / max(most, within)))
+        return float(offsets[best]) if np.count_nonzero(near[:, best]) > 1 else 0.0
+
     def moved(self, jump: float) -> Identities:
         """All reflectors, those that are waited for among them, jump by so many m."""
         if not jump:

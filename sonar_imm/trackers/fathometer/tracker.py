@@ -460,7 +460,10 @@ class FathometerTracker:
 
     def _named(self, reflectors: Reflectors, records: int) -> tuple[Identities, IdArray]:
         known = self._ids.wait(records - 1) if records <= LONGEST_GAP else self._ids.forget()
-        jump = reflectors.probable_jump
+        # Where heave begins to be a state, all depths may come to lie elsewhere together.
+        most = 2.0 * self._own.common_jump_std if reflectors.heave_std else 0.0
+        within = self._own.min_separation
+        jump = reflectors.probable_jump or known.offset(reflectors.depth, most, within)
         return known.moved(jump).name(
             reflectors.depth,
             reflectors.is_bottom,

@@ -16,6 +16,7 @@ import pytest
 
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.datum import DatumError, found_std
+from sonar_imm.trackers.fathometer.reflectors import Identified, Identities
 
 FEW = {'particles': 2000, 'frequency_min': 100.0, 'frequency_max': 2800.0, 'sound_speed_std': 0.0}
 
@@ -100,3 +101,27 @@ def test_a_right_depth_is_left_alone(kind):
     newest = found[36 * 10**9]
     assert newest.extras['array_depth_found'][0] < 0.05
     assert newest.extras['heave_std'][0] == 0.0 and tracker.warnings() == []
+
+
+def test_all_keep_their_ids_when_a_great_error_is_followed():
+    error = 0.5 * np.random.default_rng(7).standard_normal(26)
+    traces, _ = scene(error, 2, 26)
+    tracker, found = run(traces, **FEW)
+    assert tracker.warnings() and found[26 * 10**9].extras['heave_std'][0] > 0.0
+    late = [each.extras['track_id'].tolist() for stamp, each in found.items() if stamp > 10**10]
+    assert all(ids == late[0] for ids in late)
+
+
+def test_what_all_are_off_by_together():
+    known = Identities(tuple(Identified(k, z, 0) for k, z in enumerate((50.0, 54.0, 61.0, 66.0))))
+    seen = np.array([50.9, 54.92, 57.0, 66.9])
+    assert known.offset(seen, 1.5, 0.4) == pytest.approx(0.9, abs=0.03)
+    assert known.offset(seen, 0.5, 0.4) == 0.0
+    # One alone says nothing of the others, and those that are near stay.
+    assert known.offset(np.array([50.9]), 1.5, 0.4) == 0.0
+    assert known.offset(np.array([50.05, 54.0, 61.1, 67.0]), 1.5, 0.4) == pytest.approx(
+        0.0, abs=0.1
+    )
+    assert known.offset(seen, 0.0, 0.4) == 0.0
+    assert known.offset(np.empty(0), 1.5, 0.4) == 0.0
+    assert Identities().offset(seen, 1.5, 0.4) == 0.0

@@ -110,11 +110,11 @@ def test_traces_beyond_numbers_are_refused(column):
     """Squares of such values would make covariances infinite."""
     depth = np.arange(10.0, 40.0, 0.1)
     values = {'amplitude': np.sin(3.0 * depth), 'sigma': np.full(len(depth), 0.1)}
-    values[column] = 1e160 * np.abs(values[column])
+    values[column] = 1e120 * np.abs(values[column])
     tracker = FathometerTracker(FathometerConfig(particles=50))
     assert tracker.process(Trace(stamp_ns=1, depth=depth, **values)) == []
     assert tracker.counts['out_of_range'] == 1
-    values[column] = values[column] * 1e-62
+    values[column] = values[column] * 1e-22
     (estimate,) = tracker.process(Trace(stamp_ns=2, depth=depth, **values))
     seen = np.isfinite(estimate.state[:, 0])
     assert np.isfinite(estimate.covariance[seen]).all()
