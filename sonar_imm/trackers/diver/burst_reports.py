@@ -124,8 +124,10 @@ def count_bursts(known: Known, scan: Scan) -> Known:
 
 
 def current_bursts(known: Known) -> Iterator[Burst]:
-    """Yield the burst of each confirmed track that has one, of two fixes or more; of three in scans
-    of several targets, where two may be false fixes."""
+    """Yield the burst of each confirmed track that has one, of two fixes or more.
+
+    Of three in scans of several targets, where two may be false fixes.
+    """
     rows, T = known.rows, len(known)
     if not rows.tail:
         return
