@@ -41,7 +41,7 @@ from .scales import estimated_scales, weight_without_small_scales
 from .scan import Group
 from .sensors import MOST_SENSORS
 
-RECENT, LEAST_GROUP = 16, 4
+RECENT, LEAST_GROUP = 12, 4
 """Number of innovations that are compared with two places in turn, and minimum number of either,
 and of changes between them."""
 
@@ -199,21 +199,22 @@ def begin_disagreement(
     """Return rows with an offset of the sensor, for tracks whose sensors disagree, or whose sensor
     shows two places in turn, if any.
 
-    A track that has a row with an offset gets none.
+    A track that has a row with an offset gets none; for two places, one of weight.
 
     estimated: as for `fixes.update_tracks`.
     """
     association, rows, T = group.association, known.rows, len(known)
     if association is None or not T:
         return []
-    held = np.bincount(rows.target, rows.key['offset'] >= 0, T) > 0.0
-    free = association.taken & ~held
+    off, heavy = rows.key['offset'] >= 0, rows.logw > math.log(BEGINS)
+    held, firm = (np.bincount(rows.target, each, T) > 0 for each in (off, off & heavy))
     fix = association.beta.argmax(axis=1) if len(group.z) else association.fix
     distance, std = two_places(known['innovations'])
     R = group.R[fix].trace(axis1=1, axis2=2) / 2.0 if len(group.z) else std
-    turns = free & (distance > SEPARATE * std) & (np.square(distance) > DISAGREE * R)
-    turns &= len(known.memory['sensors'].names) == 1
-    found = free & association.hit & sensors_disagree(known['lately'], group.number) & ~turns
+    turns = association.taken & ~firm & (len(known.memory['sensors'].names) == 1)
+    turns &= (distance > SEPARATE * std) & (np.square(distance) > DISAGREE * R)
+    turns &= np.bincount(rows.target, rows.key['turns'], T) == 0
+    found = association.hit & ~held & ~turns & sensors_disagree(known['lately'], group.number)
     track = np.flatnonzero(found | turns)
     if not len(track):
         return []
