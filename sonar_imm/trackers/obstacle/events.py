@@ -12,12 +12,12 @@ Each echo in the gate of a track is one hypothesis of it, "none" is another. `co
 mixture after each of them and its density; the probabilities of all joint events
 (`estimation.jipda`) weigh them, with
 
-    g_ti = sum_c w_c V_c N(z_i; h_c, S_c) / lambda(z_i),
+    g_ti = sum_c w_c s_c V_c N(z_i; h_c, S_c) / lambda(z_i),
 
-V_c the probability that the beam holds component c and lambda the density of false echoes
-(`clutter`). `updated` matches the hypotheses of each component in mean and covariance. That a
-ping has no echo of a track does not weigh its components: what leaves the beam would excuse its
-own misses.
+V_c the probability that the beam holds component c, s_c what the misses since the last echo leave
+of it (`existence`), and lambda the density of false echoes (`clutter`). `updated` matches the
+hypotheses of each component in mean and covariance. That a ping has no echo of a track does not
+weigh its components: what leaves the beam would excuse its own misses.
 
 Source: docs/obstacle.md, section Tracks; Musicki and Evans 2004.
 """
@@ -69,12 +69,14 @@ def compare(
     mean, whole, nis = mixtures.innovations(before.mu, r, S)
     given, log, repairs = filter_.update(before, h[t], mine.z, R, ping.sonar)
     given, more = mine.update_height(given, pose if met is None else met.rows(t).poses, config)
+    s = table.existence.since_hit(detected(table, filter_))
+    held = (s * V).mean(axis=2)
     compared = Compared(
         t,
         i,
         given,
         log + more,
-        (given.mu * V.mean(axis=2)[t]).sum(axis=1),
+        (given.mu * held[t]).sum(axis=1),
         bodies,
         mean,
         np.diagonal(whole, axis1=1, axis2=2),

@@ -104,6 +104,13 @@ class Existence(NamedTuple):
         inside = (weight * V[..., None]).sum(axis=(1, 2))
         return np.asarray(inside / np.maximum(weight.sum(axis=(1, 2)), 1e-300))
 
+    def since_hit(self, p: FloatArray) -> FloatArray:
+        """Return s (T, K, E) of obstacles that give an echo with p (T, C) in the beam, as the
+        classes that give one have it."""
+        share = self.classes * p
+        share = share / np.maximum(share.sum(axis=1), 1e-300)[:, None]
+        return np.asarray((self.silence * share[:, None, None]).sum(axis=3))
+
     def with_ping(
         self, classes: FloatArray, hits: FloatArray, mu: FloatArray, V: FloatArray, p: FloatArray
     ) -> Existence:

@@ -29,7 +29,7 @@ class Compared(NamedTuple):
     log: FloatArray
     """(M,) log density of the echo."""
     seen: FloatArray
-    """(M,) the same with V, as a share of it."""
+    """(M,) the same with s V, as a share of it."""
     bodies: Bodies
     """(M,)"""
     innovation: FloatArray
