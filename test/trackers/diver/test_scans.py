@@ -393,7 +393,7 @@ def test_scans_near_another_track_are_counted_for_each_partner_alone():
 
 def test_warnings_of_fixes_need_evidence_and_a_bias_that_is_not_stated():
     pessimistic = FixConsistency(MEMORY, 0.4 * MEMORY, MEMORY, 0.0, MEMORY)
-    lasting = FixConsistency(MEMORY, MEMORY, MEMORY, 0.4 * MEMORY, MEMORY)
+    lasting = FixConsistency(MEMORY, 0.9 * MEMORY, MEMORY, 0.4 * MEMORY, MEMORY)
     for item in (pessimistic, lasting):
         assert 'set fix_bias_std' in item.warnings(False, 10.0)[0]
         assert item.warnings(True, 10.0) == []
@@ -401,7 +401,9 @@ def test_warnings_of_fixes_need_evidence_and_a_bias_that_is_not_stated():
     optimistic = FixConsistency(MEMORY, 2.0 * MEMORY, MEMORY, 0.0, MEMORY)
     for stated in (False, True):
         assert 'Increase covariance_scale' in optimistic.warnings(stated, 10.0)[0]
-    assert FixConsistency(MEMORY, MEMORY, MEMORY, 0.0, MEMORY).warnings(False, 10.0) == []
+    for correlation in (0.0, 0.4):  # large and correlated: a motion that no model has
+        plain = FixConsistency(MEMORY, 1.1 * MEMORY, MEMORY, correlation * MEMORY, MEMORY)
+        assert plain.warnings(False, 10.0) == []
 
 
 def beside_each_other(seed, seen, std=0.15, detection_probability=0.95, clutter=0.0):
