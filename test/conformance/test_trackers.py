@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import Navigation, Rejection
+from sonar_imm.measurements.checks import LAST_NS
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.offline.tracking import final_estimates
 
@@ -159,13 +160,12 @@ def test_numbers_that_are_not_finite_harm_nobody(run):
     assert refused + taken > 20
 
 
-LAST = 2**63 - 1
-YEAR = 365 * 86400 * SECOND
+LAST = LAST_NS - 1
 CLOCKS = {
     'from the first stamp there is': lambda stamps: [s - min(stamps) + 1 for s in stamps],
     'to the last stamp there is': lambda stamps: [s - max(stamps) + LAST for s in stamps],
     'standing still': lambda stamps: [stamps[0]] * len(stamps),
-    'leaping by years': lambda stamps: [1 + 2 * YEAR * k for k in range(len(stamps))],
+    'leaping far': lambda stamps: [1 + LAST // len(stamps) * k for k in range(len(stamps))],
     'at both ends by turns': lambda stamps: [
         LAST - k if k // 7 % 2 else 1 + k for k in range(len(stamps))
     ],
