@@ -122,7 +122,8 @@ def update_links(known: Known, _: Scan) -> Known:
         kept = np.where(wrong, -np.inf, rows.logw)
         left = rows.log_sum(kept)[rows.target]
         # A row stays where it is the last.
-        kept = np.where(np.isfinite(left), kept - left, rows.logw)
+        stays = np.isfinite(left)
+        kept = np.where(stays, kept - np.where(stays, left, 0.0), rows.logw)
         some = np.flatnonzero(np.isfinite(kept))
         rows = evolve(rows.replace(logw=kept).select(some), parent=rows.parent[some])
     long = (rows.key['link'] != 0) & (
