@@ -74,7 +74,6 @@ VARIANTS = {
             'order_max': 2,
             'phones': 4,
             'polarity': 'both',
-            'output': 'correlation',
         },
     ),
     'obstacle': (
