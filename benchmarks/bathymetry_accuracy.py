@@ -47,7 +47,7 @@ GRID: dict[str, Any] = {'engine': 'grid'}
 COMMON: dict[str, Any] = {**WALKS, 'shadow_gate': False, 'initial_std': 1.0}
 TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
     'random walk only': (
-        {'model_set': 'height_bank', 'sigmas': (1.0,), 'engine': 'particles'},
+        {**TWO, 'transition_matrix': (1.0, 0.0, 0.0, 1.0), 'initial_probabilities': (0.0, 1.0)},
         (0.401, 0.331, 0.391, 0.41, None),
     ),
     'constant slope only': ({**SLOPE_SET, **SLOPES_ONLY}, (0.119, 0.499, 0.231, 0.30, None)),
@@ -72,16 +72,6 @@ TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
     'exact forward-backward, stay .995, 0.7 m': (
         {**QUICK, **GRID, 'smoothing': 'states'},
         (0.036, 0.302, 0.128, None, 0.90),
-    ),
-    'height_bank': (
-        {
-            'model_set': 'height_bank',
-            'sigmas': (0.01, 0.05, 0.3, 1.5),
-            'rough_sigma': 0.3,
-            'engine': 'particles',
-            'stay_probability': 0.995,
-        },
-        (None,) * 5,
     ),
     'angle_two_rw': (
         {'model_set': 'angle_two_rw', 'initial_std': 0.0, 'angle_drift': False},

@@ -116,7 +116,6 @@ CASES: dict[str, Case] = {
     'roughness fractal': Case('paper', {'roughness_law': 'fractal'}, {}),
     'echoes with heavier tails': Case('paper', {'law': 'k'}, {}),
     'all three, fractal': Case('foreign', {}, {}),
-    'all three, fractal, bank': Case('foreign', {}, {'model_set': 'height_bank'}),
     'all three, fractal, terrain': Case('foreign', {}, {'model_set': 'terrain'}),
 }
 

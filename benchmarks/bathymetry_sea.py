@@ -33,7 +33,7 @@ from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 APART: dict[str, Any] = {'ping_rate': 0.3, 'patch_along': []}
 GRID: dict[str, Any] = {'engine': 'grid'}
 ANGLES: dict[str, Any] = {'model_set': 'angle_two_rw'}
-BANK: dict[str, Any] = {'model_set': 'height_bank'}
+TERRAIN: dict[str, Any] = {'model_set': 'terrain'}
 NADIR: dict[str, Any] = {'first_range': 15.1}
 LOST = 1.0
 """Metres of RMSE from which a ping is lost."""
@@ -106,27 +106,22 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     ),
     'nadir, heights': ('paper', NADIR, GRID),
     'labels, white, two walks': ('paper', {}, GRID),
-    'labels, white, bank': ('paper', {}, BANK),
+    'labels, white, terrain': ('paper', {}, TERRAIN),
     'labels, Gaussian .3 m, two walks': ('correlated', {'correlation_length': 0.3}, GRID),
-    'labels, Gaussian .3 m, bank': ('correlated', {'correlation_length': 0.3}, BANK),
+    'labels, Gaussian .3 m, terrain': ('correlated', {'correlation_length': 0.3}, TERRAIN),
     'labels, Gaussian 1 m, two walks': ('correlated', {}, GRID),
-    'labels, Gaussian 1 m, bank': ('correlated', {}, BANK),
-    'labels, Gaussian 1 m, .003 .05 .5': (
-        'correlated',
-        {},
-        {**BANK, 'sigmas': [0.003, 0.05, 0.5], 'rough_sigma': 0.05},
-    ),
-    'labels, undulation .5 m in 15 m, bank': ('undulating', {}, BANK),
-    'labels, undulation .2 m in 20 m, bank': (
+    'labels, Gaussian 1 m, terrain': ('correlated', {}, TERRAIN),
+    'labels, undulation .5 m in 15 m, terrain': ('undulating', {}, TERRAIN),
+    'labels, undulation .2 m in 20 m, terrain': (
         'undulating',
         {'undulation_height': 0.2, 'undulation_length': 20.0},
-        BANK,
+        TERRAIN,
     ),
-    'labels, slope .1, bank': ('slope', {}, BANK),
-    'labels, slope .05, bank': ('slope', {'slope': 0.05}, BANK),
-    'labels, slope .07, bank': ('slope', {'slope': 0.07}, BANK),
-    'labels, slope .1, bank, 30 dB everywhere': ('slope', LOUD, BANK),
-    'labels, undulation .5 m in 15 m, bank, 30 dB everywhere': ('undulating', LOUD, BANK),
+    'labels, slope .1, terrain': ('slope', {}, TERRAIN),
+    'labels, slope .05, terrain': ('slope', {'slope': 0.05}, TERRAIN),
+    'labels, slope .07, terrain': ('slope', {'slope': 0.07}, TERRAIN),
+    'labels, slope .1, terrain, 30 dB everywhere': ('slope', LOUD, TERRAIN),
+    'labels, undulation .5 m in 15 m, terrain, 30 dB everywhere': ('undulating', LOUD, TERRAIN),
     **{
         f'coupling {strength:g}': ('moving', {}, {**EXACT, 'ping_coupling': strength})
         for strength in (0.0, 0.15, 0.35, 0.7)

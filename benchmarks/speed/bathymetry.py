@@ -307,13 +307,9 @@ def bench_stone_soup(rounds: int = 7) -> dict[str, Any]:
 
 
 def bench_scaling(rounds: int = 7) -> dict[str, Any]:
-    """Bins a second with more models (M), more particles of each (N), more staves (P)."""
+    """Bins a second with more particles of each model (N), more staves (P)."""
     ping = a_ping()
     variants: dict[str, tuple[dict[str, Any], Snapshot]] = {}
-    for M in (1, 2, 4, 8):
-        sigmas = tuple(np.geomspace(0.01, 1.0, M).tolist())
-        bank = {'model_set': 'height_bank', 'sigmas': sigmas, 'engine': 'particles'}
-        variants[f'M = {M}'] = bank, ping
     for N in (50, 100, 300, 1000):
         variants[f'N = {N}'] = {'sigmas': SIGMAS, 'particles_per_model': N}, ping
     for P in (2, 4, 8, 16, 32):

@@ -60,15 +60,6 @@ def rmse(estimate, height):
             'height cov_height_height prob_level prob_steady prob_undulating prob_winding '
             'prob_scatter_1 prob_scatter_2 prob_scatter_3 prob_walk prob_break range angle',
         ),
-        (
-            'height_bank',
-            'height cov_height_height prob_rw_1 prob_rw_2 prob_rw_3 prob_rw_4 range angle',
-        ),
-        (
-            'scatter_bank',
-            'height cov_height_height prob_steady prob_undulating prob_scatter_1 prob_scatter_2 '
-            'prob_rw_1 prob_rw_2 prob_rw_3 range angle',
-        ),
     ],
 )
 def test_columns_are_those_of_the_contract(model_set, columns):
@@ -76,7 +67,7 @@ def test_columns_are_those_of_the_contract(model_set, columns):
     table = run(snapshot, model_set=model_set).columns()
     after = 'valid log_likelihood label label_probability'
     after += ' label_confidence told detectable_std'
-    if model_set.endswith('_bank') or model_set == 'terrain':
+    if model_set == 'terrain':
         after += ' rough'
     after += ' existence_2 surfaces geometry_std'
     assert list(table) == ['x', 'y', 'z', *columns.split(), *after.split()]
@@ -325,7 +316,7 @@ def test_noise_of_any_kind_gives_finite_answers(bins, P, exponent, holes, values
     iq = 10.0**exponent * (rng.normal(size=(bins, P)) + 1j * rng.normal(size=(bins, P)))
     iq[1:][rng.random(bins - 1) < holes] = np.nan
     snapshot = Snapshot(stamp_ns=1, range=np.sort(rng.uniform(0.0, 100.0, bins)), iq=iq)
-    only = {'height_rw_ncs': 'particles', 'scatter_bank': 'grid', 'terrain': 'gaussian'}
+    only = {'height_rw_ncs': 'particles', 'terrain': 'gaussian'}
     engines = [only[values['model_set']]] if values['model_set'] in only else ['particles', 'grid']
     for engine in engines:
         estimate = run(snapshot, engine=engine, particles_per_model=20, **values)

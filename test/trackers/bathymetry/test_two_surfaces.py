@@ -300,7 +300,6 @@ def test_surface_echoes_leave_layover_alone():
     'staves, values',
     [
         (8, {}),
-        (8, {'model_set': 'height_bank'}),
         (8, {'model_set': 'height_two_rw', 'engine': 'grid'}),
         (3, {}),
     ],
