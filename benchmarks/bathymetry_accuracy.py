@@ -44,7 +44,8 @@ GRID: dict[str, Any] = {'engine': 'grid'}
 
 # Name: parameters that differ from `COMMON`, and smooth, patch, all (m), angle (deg), overlap as
 # found before by an independent prototype; None where it was not measured.
-COMMON: dict[str, Any] = {**WALKS, 'shadow_gate': False, 'initial_std': 1.0}
+COMMON: dict[str, Any] = {**WALKS, 'gate_false_alarm': 1.0, 'initial_std': 1.0}
+GATED: dict[str, Any] = {'gate_false_alarm': 1e-3, 'initial_std': 0.0}
 TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
     'random walk only': (
         {**TWO, 'transition_matrix': (1.0, 0.0, 0.0, 1.0), 'initial_probabilities': (0.0, 1.0)},
@@ -77,9 +78,9 @@ TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
         {'model_set': 'angle_two_rw', 'initial_std': 0.0, 'angle_drift': False},
         (None,) * 5,
     ),
-    'height_two_rw, gate': ({'shadow_gate': True, 'initial_std': 0.0}, (None,) * 5),
+    'height_two_rw, gate': (GATED, (None,) * 5),
     'defaults': (
-        {'model_set': 'terrain', 'shadow_gate': True, 'initial_std': 0.0},
+        {'model_set': 'terrain', **GATED},
         (None,) * 5,
     ),
 }

@@ -23,7 +23,7 @@ from benchmarks.bathymetry_accuracy import PAPER_CHAIN, SLOPE_SET, SLOPES_ONLY
 from benchmarks.bathymetry_paper import Case, judged, PRINTED, PrintedTracker
 from benchmarks.study import Parts, Row, study
 
-OPEN: dict[str, Any] = {'shadow_gate': False}
+OPEN: dict[str, Any] = {'gate_false_alarm': 1.0}
 SLOPE: dict[str, Any] = {**OPEN, **SLOPE_SET, **SLOPES_ONLY}
 FLAT: dict[str, Any] = {'patch_std': 0.0, 'slope': 0.1}
 

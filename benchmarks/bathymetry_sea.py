@@ -54,6 +54,7 @@ STATED: dict[str, Any] = {'sonar_height': 15.0, 'sonar_height_std': 5.0}
 
 # Name: scenario, what it changes, parameters beside those of the instruments.
 CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    'motion, terrain': ('moving', APART, TERRAIN),
     'motion, grid': ('moving', APART, GRID),
     'motion, particles': ('moving', APART, {}),
     'motion, forward-backward': ('moving', APART, {**GRID, 'smoothing': 'states'}),
@@ -63,9 +64,11 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
         APART,
         {**GRID, 'sonar_lever': [0, 0, 0], 'sonar_mount_rpy_deg': [0, 0, 0]},
     ),
+    'summer profile, terrain': ('moving_profile', APART, TERRAIN),
     'summer profile, grid': ('moving_profile', APART, GRID),
     'summer profile, particles': ('moving_profile', APART, {}),
     'summer profile ignored': ('moving_profile', APART, {**GRID, 'sound_speed_profile': []}),
+    'height 10 m, told 15, terrain': ('moving', unknown(10.0), {**STATED, **TERRAIN}),
     'height 10 m, told 15, grid': ('moving', unknown(10.0), {**STATED, **GRID}),
     'height 10 m, told 15, particles': ('moving', unknown(10.0), STATED),
     'height 10 m, told 10, grid': (
@@ -93,6 +96,7 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
         {**unknown(15.0), **EXACT_NAVIGATION},
         {**STATED, **GRID},
     ),
+    'height 20 m, told 15, terrain': ('moving', unknown(20.0), {**STATED, **TERRAIN}),
     'height 20 m, told 15, grid': ('moving', unknown(20.0), {**STATED, **GRID}),
     'height 20 m, told 15, particles': ('moving', unknown(20.0), STATED),
     'nadir, angles, drift, grid': ('paper', NADIR, {**ANGLES, **GRID}),
@@ -104,6 +108,7 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
         NADIR,
         {**ANGLES, **GRID, 'sigmas_deg': [0.03, 0.1, 2.0]},
     ),
+    'nadir, terrain': ('paper', NADIR, TERRAIN),
     'nadir, heights': ('paper', NADIR, GRID),
     'labels, white, two walks': ('paper', {}, GRID),
     'labels, white, terrain': ('paper', {}, TERRAIN),
@@ -125,6 +130,10 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     **{
         f'coupling {strength:g}': ('moving', {}, {**EXACT, 'ping_coupling': strength})
         for strength in (0.0, 0.15, 0.35, 0.7)
+    },
+    **{
+        f'coupling {strength:g}, terrain': ('moving', {}, {**TERRAIN, 'ping_coupling': strength})
+        for strength in (0.0, 0.15)
     },
     **{
         f'staves 2, {spacing:g} wavelengths, {share:.0%} differ, told {stated:.0%}': (

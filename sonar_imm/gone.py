@@ -97,6 +97,7 @@ GONE: dict[str, str] = {
             'max_navigation_gap',
             *('sigma_reference_bin', 'grid_step', 'grid_extent'),
             *('initial_slope_std', 'redrawn_slope_std', 'multipath_level_db', 'likelihood'),
+            *('initial_mean', 'initial_std'),
             'max_extrapolation',
             *('array_depth_age', 'heave_memory', 'white_noise_gain_db', 'depth_step'),
             *('slope_switch_probability', 'negative_probability', 'amplitude_memory'),
@@ -134,6 +135,7 @@ GONE: dict[str, str] = {
         )
         for name in ('height_bank', 'scatter_bank')
     },
+    'parameter shadow_gate': 'was removed: 1 is no gate (parameter gate_false_alarm)',
     **{
         f'parameter {name}': 'was removed: terrain, the default, has models of rough floor'
         for name in ('rough_sigma', 'scatters')

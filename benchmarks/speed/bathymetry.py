@@ -209,9 +209,9 @@ def rates(
 def engines(ping: Snapshot) -> dict[str, Timed]:
     """The tracker with the settings of the peers, with its coherence gate, and with the grid."""
     variants: dict[str, dict[str, Any]] = {
-        'particles': {'shadow_gate': False},
+        'particles': {'gate_false_alarm': 1.0},
         'gated': {},
-        'grid': {'engine': 'grid', 'shadow_gate': False},
+        'grid': {'engine': 'grid', 'gate_false_alarm': 1.0},
     }
     trackers = {name: BathymetryTracker(config(**values)) for name, values in variants.items()}
     return {
@@ -316,7 +316,9 @@ def bench_scaling(rounds: int = 7) -> dict[str, Any]:
         variants[f'P = {P}'] = {'sigmas': SIGMAS}, a_ping(staves=P)
     methods: dict[str, Timed] = {}
     for name, (values, shot) in variants.items():
-        tracker = BathymetryTracker(BathymetryConfig(**{**WALKS, 'shadow_gate': False, **values}))
+        tracker = BathymetryTracker(
+            BathymetryConfig(**{**WALKS, 'gate_false_alarm': 1.0, **values})
+        )
         methods[name] = partial(tracker.process, shot), len(shot)
     return {'bins_per_second': rates(methods, rounds)}
 
@@ -332,7 +334,7 @@ def bench_threads(rounds: int = 7, pings: int = 16) -> dict[str, Any]:
 
     most = min(4, os.cpu_count() or 1)
     groups = {
-        n: [BathymetryTracker(config(shadow_gate=False)) for _ in range(n)]
+        n: [BathymetryTracker(config(gate_false_alarm=1.0)) for _ in range(n)]
         for n in sorted({1, most})
     }
     methods = {
@@ -343,7 +345,7 @@ def bench_threads(rounds: int = 7, pings: int = 16) -> dict[str, Any]:
 
 
 def _heights(ping: Snapshot) -> np.ndarray:
-    tracker = BathymetryTracker(config(shadow_gate=False))
+    tracker = BathymetryTracker(config(gate_false_alarm=1.0))
     return tracker.process(ping)[0].state[:, 0]
 
 

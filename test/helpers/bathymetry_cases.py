@@ -34,7 +34,7 @@ def vector(name):
         'initial_probabilities': case['mu0'].tolist(),
         'initial_std': float(case['sd0']),
         'particles_per_model': 3000,
-        'shadow_gate': False,
+        'gate_false_alarm': 1.0,
         **EXACT,
     }
     if name.startswith('set_ii_'):

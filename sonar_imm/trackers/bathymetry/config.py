@@ -40,6 +40,8 @@ SPEED_STD, SPEED_STD_OF_NONE = 2.0, 15.0
 """m/s, of a sound speed that a snapshot states, and of one that nobody does."""
 BEND_STD = 0.5
 """m/s, of the mean sound speed below the array: what bends a ray."""
+USUAL_ALARM, HIGHEST_ALARM = 1e-3, 0.5
+"""`gate_false_alarm`, and the highest one of a test."""
 STEEP_DEG = 60.0
 """An array that looks down by so much runs angle models."""
 OF_OTHER_SETS = (
@@ -88,10 +90,10 @@ class BathymetryConfig(MountingParameters):
     initial_probabilities: tuple[float, ...] = live((), '',
         'model probabilities before the first bin; empty: uniform', range=(0.0, 1.0),
         kind='float[]')
-    initial_mean: float = live(0.0, '',
+    initial_mean: float = constant(0.0, '',
         'state before the first bin: height of the floor in m, or angle in rad (see initial_std)',
         range=(-1000.0, 1000.0))
-    initial_std: float = live(0.0, '',
+    initial_std: float = constant(0.0, '',
         'standard deviation of the state before the first bin, m or rad; 0: 1 m, or 5 deg around '
         'the angle of the first echo of the reference floor', range=(0.0, 1000.0))
     initial_slope_std: float = constant(0.1, '',
@@ -132,11 +134,10 @@ class BathymetryConfig(MountingParameters):
     noise_variance: float = live(0.0, '',
         'noise power at a stave, for snapshots that do not state it; 0: estimated from the water '
         'column, or blindly where there is none', range=(0.0, 1e30))
-    shadow_gate: bool = live(True, '',
-        'bridge bins without a coherent echo with the smoothest model')
-    gate_false_alarm: float = live(1e-3, '',
-        'probability that the test for a coherent echo (shadow_gate) takes noise for an echo',
-        range=(1e-9, 0.5))
+    gate_false_alarm: float = live(USUAL_ALARM, '',
+        'probability that the test for a coherent echo takes noise for one, at most 0.5; bins '
+        'without an echo are bridged with the smoothest model; 1: no test, every bin is an echo',
+        range=(1e-9, 1.0))
     decorrelation: float = live(0.0, '',
         'share of the power of an echo that differs from stave to stave, as from a diffuse floor '
         'under a wide aperture; it acts as noise', range=(0.0, 0.95))
@@ -203,7 +204,7 @@ class BathymetryConfig(MountingParameters):
     # -- how well it is known --------------------------------------------------------------------
     sonar_height_std: float = live(0.0, 'm',
         'standard deviation of sonar_height; the filter then starts at the first return; 0: '
-        'sonar_height is exact, see initial_std', range=(0.0, 1000.0))
+        'sonar_height is exact', range=(0.0, 1000.0))
     attitude_std_deg: float = live(0.05, 'deg',
         'standard deviation of roll and pitch in nav', range=(0.0, 45.0))
     heading_std_deg: float = live(0.1, 'deg',
@@ -249,15 +250,16 @@ class BathymetryConfig(MountingParameters):
                 'ping_coupling needs what a whole ping says of each bin: smoothing states (model '
                 'set terrain, or engine grid) or modes'
             )
-        if self.model_set == 'angle_two_rw' and abs(self.initial_mean) > 0.5 * math.pi:
-            problems.append(
-                f'initial_mean is an angle for angle_two_rw, between -pi/2 and pi/2, not '
-                f'{self.initial_mean:g}'
-            )
         return problems
 
     def _ship_problems(self) -> list[str]:
-        problems = [
+        problems = []
+        if HIGHEST_ALARM < self.gate_false_alarm < 1.0:
+            problems.append(
+                f'gate_false_alarm is at most {HIGHEST_ALARM}, or 1 for no test, not '
+                f'{self.gate_false_alarm:g}'
+            )
+        problems += [
             f'{name} needs three values, got {len(getattr(self, name))}'
             for name in ('sonar_lever', 'sonar_mount_rpy_deg')
             if len(getattr(self, name)) != 3
@@ -328,6 +330,16 @@ class BathymetryConfig(MountingParameters):
             std = SPEED_STD_OF_NONE if stated is None else SPEED_STD
         speed = stated or self.sound_speed
         return GeometryDoubt(math.radians(self.tilt_std_deg), self.spacing_std, std / speed)
+
+    @property
+    def is_gated(self) -> bool:
+        """Whether bins are tested for an echo."""
+        return self.gate_false_alarm < 1.0
+
+    @property
+    def false_alarm(self) -> float:
+        """Of the test for an echo. The first one of a ping is looked for without the gate, too."""
+        return self.gate_false_alarm if self.is_gated else USUAL_ALARM
 
     @property
     def looks_down(self) -> bool:

@@ -148,7 +148,7 @@ def test_a_conjugated_array_is_a_matter_of_wiring():
 
 def test_staves_are_taken_as_they_come():
     for P in (2, 3, 16, 64):
-        estimate = run(floor(PATCH, P=P), shadow_gate=False)
+        estimate = run(floor(PATCH, P=P), gate_false_alarm=1.0)
         assert rmse(estimate, PATCH) < 0.6 / math.sqrt(P)
 
 
@@ -182,7 +182,7 @@ def test_the_slope_is_found_where_the_slope_model_holds():
 def test_a_shadow_is_passed_over_and_marked():
     shadow = slice(100, 160)
     snapshot = floor(0.0, shadow=shadow)
-    gated, blind = run(snapshot), run(snapshot, shadow_gate=False)
+    gated, blind = run(snapshot), run(snapshot, gate_false_alarm=1.0)
     valid = gated.extras['valid'].astype(bool)
     assert not valid[shadow].any() and valid[:90].mean() > 0.9
     assert rmse(gated, 0.0) < 0.2 < 0.5 < rmse(blind, 0.0)
@@ -199,7 +199,7 @@ def test_bins_that_are_not_finite_are_passed_over(engine):
     iq[70, 3] = np.inf
     iq[80] = 0.0
     tracker = BathymetryTracker(
-        BathymetryConfig(model_set='height_two_rw', engine=engine, shadow_gate=False)
+        BathymetryConfig(model_set='height_two_rw', engine=engine, gate_false_alarm=1.0)
     )
     estimate = tracker.process(evolve(snapshot, iq=iq))[0]
     assert np.flatnonzero(estimate.extras['valid'] == 0).tolist() == [*range(50, 60), 70, 80]
@@ -304,7 +304,7 @@ def test_sizes_may_change_from_ping_to_ping():
     values=st.fixed_dictionaries(
         {
             'model_set': st.sampled_from(MODEL_SETS),
-            'shadow_gate': st.booleans(),
+            'gate_false_alarm': st.sampled_from([1e-3, 1.0]),
             'multipath': st.booleans(),
             'likelihood': st.sampled_from(['laplace', 'gaussian']),
             'sonar_height': st.floats(0.1, 200.0),
@@ -348,7 +348,7 @@ def test_noise_of_any_kind_gives_finite_answers(bins, P, exponent, holes, values
         ({'model_set': 'height_two_rw', 'initial_probabilities': [0.7, 0.7]}, 'sum to 1.4'),
         ({'model_set': 'height_rw_ncs', 'engine': 'grid'}, 'one state'),
         ({'model_set': 'height_two_rw', 'smoothing': 'states'}, 'or engine grid'),
-        ({'model_set': 'angle_two_rw', 'initial_mean': 2.0}, 'initial_mean is an angle'),
+        ({'gate_false_alarm': 0.7}, 'at most 0.5, or 1 for no test'),
         ({'model_set': 'height_two_rws'}, "did you mean 'height_two_rw'"),
         ({'particles_per_model': 1}, 'between 2 and'),
     ],
@@ -419,7 +419,7 @@ def test_direction_sines_write_only_those_asked_for():
 
 def test_particles_that_are_all_alike_are_not_sure():
     """A floor far from all particles, without a gate: one of them has all the weight."""
-    values = {'model_set': 'height_two_rw', 'particles_per_model': 2, 'shadow_gate': False}
+    values = {'model_set': 'height_two_rw', 'particles_per_model': 2, 'gate_false_alarm': 1.0}
     values |= EXACT
     made = run(floor(-9.0, snr_db=40.0), initial_std=0.01, seed=3, **values)
     assert made.covariance[:, 0, 0].min() >= 0.005**2
