@@ -22,14 +22,14 @@ from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
 
-def tracked(name, tmp_path, **more):
+def tracked(name, tmp_path):
     """The case and the columns of its estimate.csv."""
     case, config, snapshot = vector(name)
     bag, file = tmp_path / 'bag', tmp_path / 'params.yaml'
     with BagWriter(bag) as writer:
         message = write_snapshot(evolve(snapshot, stamp_ns=10**9), ros_message)
         writer.write('/snapshot', message, 10**9)
-    values = json_parameters(evolve(config, **more))
+    values = json_parameters(config)
     file.write_text(json.dumps({'/**': {'ros__parameters': values}}))
     assert main(['track', str(bag), str(tmp_path / 'out'), '--params', str(file)]) == 0
     with open(tmp_path / 'out' / 'estimate.csv', newline='') as file:
@@ -45,12 +45,3 @@ def test_particles_meet_the_exact_filter(name, tmp_path):
     assert error.mean() <= 0.035
     rough = case['mu'].reshape(len(error), 2)[:, 1]
     assert np.abs(table['prob_rw_rough'] - rough).mean() <= 0.006
-
-
-@pytest.mark.parametrize('name', ['set_ii_0', 'set_iii_0'])
-def test_the_grid_is_the_exact_filter(name, tmp_path):
-    case, table = tracked(name, tmp_path, engine='grid')
-    state = 'angle' if name.startswith('set_iii') else 'height'
-    error = np.abs(table[state] - case['m'].ravel()) / np.sqrt(case['v'].ravel())
-    # What is left is the single precision of the recording, and of the exact filter's own grid.
-    assert error.mean() <= 1e-3
