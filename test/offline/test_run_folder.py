@@ -46,7 +46,11 @@ def contents(folder):
 
 
 def test_estimates_come_back_bit_for_bit(folder):
-    assert folder.write_estimates(ESTIMATES, 'diver') == {'estimates': 20, 'rows': 20}
+    assert folder.write_estimates(ESTIMATES, 'diver') == {
+        'first_stamp_ns': ESTIMATES[0].stamp_ns,
+        'estimates': 20,
+        'rows': 20,
+    }
     for read, written in zip(folder.read_estimates(), ESTIMATES, strict=True):
         np.testing.assert_array_equal(read.state, written.state)
         np.testing.assert_array_equal(read.covariance, written.covariance)
