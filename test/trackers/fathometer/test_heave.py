@@ -67,17 +67,6 @@ def test_layers_are_followed_although_the_array_heaves(scene):
     assert last.extras['two_way_time'] == pytest.approx(expected, abs=1e-12)
 
 
-def test_without_the_state_they_are_lost(scene):
-    """Unless all of them may jump together: then their depths are as wrong as the array's."""
-    still = {'particles': 2000, 'slope_std': 0.0, 'heave': 'none'}
-    _, jumping = run(scene.traces(range(40)), **still)
-    assert score_scene(jumping, scene, after=20).right > 0.9
-    _, found = run(scene.traces(range(40)), **still, common_jump_probability=0.0)
-    assert score_scene(found, scene, after=20).right < 0.5
-    assert all((each.extras['heave'] == 0.0).all() for each in found.values())
-    assert all((each.extras['heave_std'] == 0.0).all() for each in found.values())
-
-
 def lasting(scene, seed, records=40):
     """The same layers, the errors of an autoregression in place of the independent ones; and these
     errors."""
@@ -185,21 +174,6 @@ def test_an_error_that_lasts_is_followed_with_a_memory(scene):
     assert score_scene(found, scene, after=15).right >= 0.95
     _, relative, _, _ = errors(found, scene, after=15)
     assert rms(relative) <= 0.03
-
-
-def test_threads_do_not_change_a_byte(scene):
-    def columns(**parameters):
-        _, found = run(
-            scene.traces(range(6)),
-            particles=1001,
-            heave='memory',
-            array_depth_std=0.5,
-            polarity='both',
-            **parameters,
-        )
-        return [c.tobytes() for each in found.values() for c in each.columns().values()]
-
-    assert columns() == columns(threads=4)
 
 
 def test_what_heave_needs():

@@ -154,14 +154,6 @@ def test_what_came_later_corrects_an_estimate(vectors):
     assert later[1] <= now[1] + 0.003
 
 
-@pytest.mark.statistics
-def test_noise_that_is_stated_too_low_gives_wrong_numbers(vectors):
-    records = range(0, 60)
-    right, _ = score(run(traces(vectors, records), particles=3000)[1], vectors)
-    low, _ = score(run(traces(vectors, records, scale=0.7), particles=3000)[1], vectors)
-    assert low < right - 0.5
-
-
 def test_noise_alone_has_no_reflector():
     rng = np.random.default_rng(0)
     depth = np.arange(100.0, 150.0, 0.1)
@@ -222,26 +214,6 @@ def test_the_same_input_gives_the_same_bytes(vectors):
     assert columns() != columns(seed=1)
 
 
-def test_late_repeated_and_restarted_input(vectors):
-    given = list(traces(vectors, range(8)))
-    tracker = FathometerTracker(FathometerConfig(particles=200))
-    for k in (3, 3, 1, 4):
-        tracker.process(given[k])
-    assert tracker.counts['duplicate'] == 1
-    assert tracker.counts['too_late'] == 1
-    assert tracker.counts['used'] == 2
-    tracker = FathometerTracker(FathometerConfig(particles=200))
-    estimates = [tracker.process(given[k]) for k in (7, 0, 1, 2, 3)]
-    assert [len(each) for each in estimates] == [1, 0, 0, 3, 1]
-    assert tracker.counts['restarts'] == 1
-    # Nothing says that what is seen now is what was seen before: no identity is used again.
-    before, after = (
-        {int(item) for each in part for e in each for item in e.extras['track_id'] if item}
-        for part in (estimates[:3], estimates[3:])
-    )
-    assert before and after and max(before) < min(after)
-
-
 def test_strange_input_is_counted():
     tracker = SYSTEMS['fathometer'].build(FathometerConfig(particles=100))
     assert tracker.process(Fix(stamp_ns=1, position=np.zeros(3))) == []
@@ -273,12 +245,6 @@ def test_a_running_tracker_takes_over_what_may_change():
     assert tracker.config.existence_min == 0.7
     with pytest.raises(ValueError, match='particles'):
         tracker.reconfigure(FathometerConfig(particles=7))
-
-
-def test_a_warm_tracker_is_as_new():
-    tracker = FathometerTracker(FathometerConfig(particles=50, depth_min=100.0, depth_max=150.0))
-    tracker.warm()
-    assert not tracker.counts and tracker.response is None
 
 
 @pytest.mark.parametrize(
