@@ -63,41 +63,28 @@ def test_jacobians_equal_finite_differences(position, tx, rx, z):
     away = [np.hypot(*(position - point[:2])) for point in (tx, rx)]
     assume(min(away) > 0.5)
     tx, rx = tx[None], rx[None]
-    assert_allclose(
-        multistatic.range_sum_jacobian(position, tx, rx, z),
-        slope(lambda p: multistatic.range_sum(p, tx, rx, z), position),
-        atol=1e-6,
-    )
-    assert_allclose(
-        direction(position, rx, z), slope(lambda p: distance(p, rx, z), position), atol=1e-6
-    )
+    found = multistatic.range_sum_jacobian(position, tx, rx, z)
+    due = slope(lambda p: multistatic.range_sum(p, tx, rx, z), position)
+    assert_allclose(found, due, atol=1e-6)
+    due = slope(lambda p: distance(p, rx, z), position)
+    assert_allclose(direction(position, rx, z), due, atol=1e-6)
     around = multistatic.bearing(position, rx)
-    assert_allclose(
-        multistatic.bearing_jacobian(position, rx),
-        slope(lambda p: wrap_angle(multistatic.bearing(p, rx) - around), position),
-        rtol=1e-6,
-        atol=1e-7,
-    )
+    due = slope(lambda p: wrap_angle(multistatic.bearing(p, rx) - around), position)
+    assert_allclose(multistatic.bearing_jacobian(position, rx), due, rtol=1e-6, atol=1e-7)
 
 
 @quick
 @given(PLACE, POINT, POINT, st.floats(-4.0, 4.0), PLACE)
 def test_models_turn_and_move_with_the_scene(position, tx, rx, angle, shift):
     assume(np.hypot(*(position - rx[:2])) > 0.1)
-    tx, rx = tx[None], rx[None]
-    moved = [turned(each, angle, shift) for each in (position, tx, rx)]
-    assert_allclose(
-        multistatic.range_sum(*moved, -5.0),
-        multistatic.range_sum(position, tx, rx, -5.0),
-        rtol=1e-9,
-    )
-    gain = multistatic.bearing(moved[0], moved[2]) - multistatic.bearing(position, rx)
+    given = position, tx[None], rx[None]
+    moved = [turned(each, angle, shift) for each in given]
+    found, due = (multistatic.range_sum(*each, -5.0) for each in (moved, given))
+    assert_allclose(found, due, rtol=1e-9)
+    gain = multistatic.bearing(moved[0], moved[2]) - multistatic.bearing(position, rx[None])
     assert_allclose(wrap_angle(gain - angle), 0.0, atol=1e-9)
-    assert_allclose(
-        multistatic.range_sum_jacobian(*moved, -5.0),
-        turned(multistatic.range_sum_jacobian(position, tx, rx, -5.0), angle, 0.0),
-        atol=1e-6,
-    )
+    found, due = (multistatic.range_sum_jacobian(*each, -5.0) for each in (moved, given))
+    assert_allclose(found, turned(due, angle, 0.0), atol=1e-6)
 
 
 def test_hand_worked_values():
@@ -156,13 +143,11 @@ def test_emission_time_and_its_variance_are_those_of_the_joint_estimate():
     n = 6
     _, rx, truth, variance = scene(n, seed=21)
     toa = distance(truth, rx, -4.0) / SOUND_SPEED + 77.25
-    time, _ = multistatic.emission_time(
-        toa, variance, rx, truth, target_z=-4.0, sound_speed=SOUND_SPEED
-    )
+    known = {'target_z': -4.0, 'sound_speed': SOUND_SPEED}
+    time, _ = multistatic.emission_time(toa, variance, rx, truth, **known)
     assert time == pytest.approx(77.25, abs=1e-12)
     augmented = np.column_stack([direction(truth, rx, -4.0) / SOUND_SPEED, np.ones(n)])
     joint = np.linalg.inv(augmented.T @ np.diag(1.0 / variance) @ augmented)
-    _, stated = multistatic.emission_time(
-        toa, variance, rx, truth, target_z=-4.0, sound_speed=SOUND_SPEED, covariance=joint[:2, :2]
-    )
+    known['covariance'] = joint[:2, :2]
+    _, stated = multistatic.emission_time(toa, variance, rx, truth, **known)
     assert stated == pytest.approx(joint[2, 2], rel=1e-9)

@@ -67,14 +67,7 @@ def test_after_too_long_a_gap_all_is_new():
     tracker, found = run(traces[:10], max_gap=1e8, **OPTIONS)
     before = max(found.values(), key=lambda each: each.stamp_ns).extras['track_id']
     late = traces[10].stamp_ns + (LONGEST_GAP + 1) * 10 * 10**9
-    (estimate,) = tracker.process(
-        type(traces[10])(
-            stamp_ns=late,
-            depth=traces[10].depth,
-            amplitude=traces[10].amplitude,
-            sigma=traces[10].sigma,
-        )
-    )
+    (estimate,) = tracker.process(evolve(traces[10], stamp_ns=late))
     assert not set(estimate.extras['track_id']) & set(before)
     assert len(before) == len(LAYERS) and tracker.counts['gaps'] == 1
 
