@@ -6,6 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
+from attrs import evolve
 import numpy as np
 
 from sonar_imm.estimates import Estimate
@@ -79,24 +80,4 @@ def test_without_layover_there_is_one_surface():
 def test_estimates_without_navigation_have_no_soundings():
     plain = estimate()
     extras = {k: v for k, v in plain.extras.items() if 'uncertainty' not in k}
-    assert (
-        soundings_of(
-            Estimate(
-                **{
-                    **{
-                        f: getattr(plain, f)
-                        for f in (
-                            'stamp_ns',
-                            'frame_id',
-                            'xyz',
-                            'state_names',
-                            'state',
-                            'covariance',
-                        )
-                    },
-                    'extras': extras,
-                }
-            )
-        )
-        is None
-    )
+    assert soundings_of(evolve(plain, extras=extras)) is None
