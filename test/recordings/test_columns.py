@@ -51,6 +51,9 @@ def table(tmp_path):
         ('time;Distance;Relèvement;Cap', 'stamp range bearing heading'),
         ('Zeit;Entfernung;Peilung;Zielnummer', 'stamp range bearing id'),
         ('time;Target Lat;Target Lon', 'stamp latitude longitude'),
+        ('Latitude_deg;lon [deg]', 'latitude longitude'),
+        ('GPS Lat;GPS Long', 'latitude longitude'),
+        ('lat_dd;lon_dd', 'latitude longitude'),
     ],
 )
 def test_headers_in_six_languages(table, headers, found):
