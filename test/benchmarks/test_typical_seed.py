@@ -42,15 +42,9 @@ def test_a_run_without_the_error_is_worse_than_any_and_most_must_have_it():
 
 def test_the_text_names_the_command_the_seeds_and_the_limit():
     given = Namespace(
-        system='diver',
-        scene='table1',
-        runs=5,
-        seed=1,
-        set=['speed=2'],
-        metric=['position.rmse_m'],
-        compress=[],
-        write='somewhere/diver_table1',
-    )
+        system='diver', scene='table1', runs=5, seed=1, set=['speed=2'],
+        metric=['position.rmse_m'], compress=[], write='somewhere/diver_table1',
+    )  # fmt: skip
     found = typical(outcomes(**{'position.rmse_m': [5.0, 1.0, 3.0, 2.0, 4.0]}), given.metric)
     text = readme(given, found, Limit(1.0, 'm', 'position RMSE', 'position.rmse_m'), 0)
     assert 'simulate diver bags/diver_table1 --scenario table1 --seed 3 --set speed=2' in text

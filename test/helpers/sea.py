@@ -30,11 +30,9 @@ def motion_case():
 
 def sea_config(case, **values):
     stated = {
-        'sonar_lever': case['lever'].tolist(),
-        'sonar_mount_rpy_deg': case['mount_deg'].tolist(),
-        'tilt_deg': float(case['tilt_deg']),
-        'side': str(case['side']),
-    }
+        'sonar_lever': case['lever'].tolist(), 'sonar_mount_rpy_deg': case['mount_deg'].tolist(),
+        'tilt_deg': float(case['tilt_deg']), 'side': str(case['side']),
+    }  # fmt: skip
     return BathymetryConfig(**{**EXACT, **stated, **values})
 
 
@@ -42,25 +40,21 @@ def navigation(case, *, late_s=0.0):
     """The poses of the case, their stamps wrong by `late_s`."""
     return [
         Navigation(
-            stamp_ns=START_NS + round((t + late_s) * 1e9),
-            position=p,
-            orientation=q,
+            stamp_ns=START_NS + round((t + late_s) * 1e9), position=p, orientation=q,
             frame_id='map',
         )
         for t, p, q in zip(case['tn'], case['pn'], case['qn'])
-    ]
+    ]  # fmt: skip
 
 
 def snapshots(case):
     for t, parts in zip(case['t'], case['iq'].astype(np.float64)):
         yield Snapshot(
-            stamp_ns=START_NS + round(t * 1e9),
-            frame_id='sonar',
-            range=case['r'],
+            stamp_ns=START_NS + round(t * 1e9), frame_id='sonar', range=case['r'],
             iq=parts[..., 0] + 1j * parts[..., 1],
             noise_variance=np.full(len(case['r']), float(case['sn2'])),
             sound_speed=float(case['c']),
-        )
+        )  # fmt: skip
 
 
 def swath_of(case, config, snapshot, *, late_s=0.0, pose_of='reception'):

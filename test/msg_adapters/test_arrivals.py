@@ -86,13 +86,11 @@ def test_variances_that_are_none_become_unknown():
 def test_each_kind_of_variance_has_its_own_least_value():
     arrivals = read_arrivals(
         message(
-            var_toa=np.float32([1e-14, 1e-19, 1e-14]),
-            bearing=np.zeros(3),
-            var_bearing=np.float32([1e-11, 1e-14, 1e-11]),
-            depth=np.zeros(3),
+            var_toa=np.float32([1e-14, 1e-19, 1e-14]), bearing=np.zeros(3),
+            var_bearing=np.float32([1e-11, 1e-14, 1e-11]), depth=np.zeros(3),
             var_depth=np.float32([1e-7, 1e-11, 1e-7]),
         )
-    )
+    )  # fmt: skip
     for variance in (arrivals.var_toa, arrivals.var_bearing, arrivals.var_depth):
         assert np.isnan(variance).tolist() == [False, True, False]
 
@@ -147,17 +145,11 @@ def test_what_cannot_be_used_is_refused_with_its_reason(code, changes):
 def test_writing_and_reading_gives_the_same_arrivals(bearing):
     nowhere = np.full((2, 3), np.nan)
     arrivals = Arrivals(
-        stamp_ns=10**18 + 1,
-        tx_id=[0, 0],
-        rx_id=[3, 65535],
-        tx=nowhere,
-        rx=[[1 / 3, 2.0, -1.0], [4.0, 5.0, 6.0]],
-        toa=[0.0, 0.1],
-        var_toa=np.float32([1e-6, np.nan]),
-        bearing=bearing,
-        var_bearing=np.float32(bearing * 0.1),
-        frame_id='map',
-    )
+        stamp_ns=10**18 + 1, tx_id=[0, 0], rx_id=[3, 65535], tx=nowhere,
+        rx=[[1 / 3, 2.0, -1.0], [4.0, 5.0, 6.0]], toa=[0.0, 0.1],
+        var_toa=np.float32([1e-6, np.nan]), bearing=bearing,
+        var_bearing=np.float32(bearing * 0.1), frame_id='map',
+    )  # fmt: skip
     again = read_arrivals(write_arrivals(arrivals, ros_message))
     assert again.stamp_ns == arrivals.stamp_ns and again.frame_id == 'map'
     for name in ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing'):

@@ -186,11 +186,9 @@ def test_a_covariance_of_another_size_is_refused():
 @pytest.mark.parametrize('covariance', [None, [[4.0, 0.1], [0.1, 9.0]], WHOLE, ONLY_Z])
 def test_writing_and_reading_gives_the_same_fix(covariance):
     fix = Fix(
-        stamp_ns=1700000000123456789,
-        position=(1 / 3, -2e5, 0.5),
-        covariance=covariance,
+        stamp_ns=1700000000123456789, position=(1 / 3, -2e5, 0.5), covariance=covariance,
         frame_id='map',
-    )
+    )  # fmt: skip
     message = write_fix(fix, ros_message)
     again = read_fix(message)
     assert again.stamp_ns == fix.stamp_ns and again.frame_id == 'map'
@@ -368,14 +366,9 @@ def estimate(names=('px', 'py', 'vx', 'vy')):
     state = np.arange(1.0, n + 1.0)[None] * 1000.0
     covariance = (np.eye(n) + 0.1)[None]
     return Estimate(
-        stamp_ns=STAMP,
-        frame_id='map',
-        xyz=state[:, :3].astype(np.float32),
-        state_names=names,
-        state=state,
-        covariance=covariance,
-        extras={'track_id': np.array([4], np.uint32)},
-    )
+        stamp_ns=STAMP, frame_id='map', xyz=state[:, :3].astype(np.float32), state_names=names,
+        state=state, covariance=covariance, extras={'track_id': np.array([4], np.uint32)},
+    )  # fmt: skip
 
 
 def test_an_estimate_is_written_as_navsatfix_and_read_back():

@@ -86,13 +86,9 @@ class TestDecode:
                 data[at + 1 : at + 5] = np.array([10 * r + c, 7], '<i2').tobytes()
                 data[at + 7 : at + 11] = np.array([r - c], '<f4').tobytes()
         message = cloud(
-            [('v', 1, 3, 2), ('f', 7, 7, 1)],
-            bytes(data),
-            height=2,
-            width=3,
-            point_step=step,
+            [('v', 1, 3, 2), ('f', 7, 7, 1)], bytes(data), height=2, width=3, point_step=step,
             row_step=row,
-        )
+        )  # fmt: skip
         columns = decode_table(message)
         assert columns['v'].tolist() == [[0, 7], [1, 7], [2, 7], [10, 7], [11, 7], [12, 7]]
         assert columns['f'].tolist() == [0, -1, -2, 1, 0, -1]
@@ -117,14 +113,10 @@ class TestDecode:
         for height, width, step in ((1, 0, 8), (0, 5, 8), (0, 0, 8)):
             columns = decode_table(
                 cloud(
-                    [('a', 0, 8, 1), ('b', 0, 1, 3)],
-                    b'',
-                    height=height,
-                    width=width,
-                    point_step=step,
-                    row_step=width * step,
+                    [('a', 0, 8, 1), ('b', 0, 1, 3)], b'', height=height, width=width,
+                    point_step=step, row_step=width * step,
                 )
-            )
+            )  # fmt: skip
             assert columns['a'].shape == (0,) and columns['a'].dtype == np.float64
             assert columns['b'].shape == (0, 3)
         assert decode_table(cloud([], b'', width=0, point_step=0)) == {}
@@ -169,13 +161,10 @@ class TestEncode:
     def test_x_y_z_come_first_and_nothing_is_padded(self):
         message = encode(
             {
-                'id': np.array([1], np.uint8),
-                'z': np.float32([3]),
-                'iq': np.float32([[1, 2]]),
-                'x': np.float32([1]),
-                'y': np.float32([2]),
+                'id': np.array([1], np.uint8), 'z': np.float32([3]), 'iq': np.float32([[1, 2]]),
+                'x': np.float32([1]), 'y': np.float32([2]),
             }
-        )
+        )  # fmt: skip
         assert [field.name for field in message.fields] == ['x', 'y', 'z', 'id', 'iq']
         assert [field.offset for field in message.fields] == [0, 4, 8, 12, 13]
         assert message.point_step == 21 and message.row_step == 21 and len(message.data) == 21

@@ -113,7 +113,7 @@ def test_scores_are_those_done_by_hand():
     chord = np.hypot(40.0 * (1.0 - np.cos(0.01)), 40.0 * np.sin(0.01))
     assert metrics['gospa']['mean_m'] == pytest.approx((np.sqrt(0.09 + 12.5) + chord) / 2.0)
     assert metrics['gospa']['false_per_ping'] == pytest.approx(0.5)
-    counts = dict(true_obstacles=1, found_obstacles=1, tracks=2, false_tracks=1)
+    counts = {'true_obstacles': 1, 'found_obstacles': 1, 'tracks': 2, 'false_tracks': 1}
     assert metrics['tracks'] == {**counts, 'identity_switches': 0}
     assert found.target.tolist() == [0, 0]
 

@@ -156,11 +156,9 @@ def test_navigation_in_a_table_beside_the_snapshots(convert, tmp_path):
         + '1000000005,bad,10.47,30,5,2\n'
     )
     report, received, _ = convert(
-        {'nav': tmp_path / 'nav.csv'},
-        iq=samples(3, 30, 2),
-        range=RANGES,
+        {'nav': tmp_path / 'nav.csv'}, iq=samples(3, 30, 2), range=RANGES,
         stamp=np.arange(3.0) + 1e9,
-    )
+    )  # fmt: skip
     poses = [item for item in received if isinstance(item, Navigation)]
     assert report.messages == {'/nav': 4, '/snapshot': 3} and report.bad_rows == 1
     assert poses[2].position == pytest.approx([0.0, 2e-5 * 111_414.0, -2.0], abs=1e-3)
@@ -341,17 +339,10 @@ def line(tmp_path):
     """Seven traces of 30 samples every 100 us, four a second, from a recorder that starts late."""
     rows, path = np.arange(7), tmp_path / 'line.seg'
     write_segy(
-        path,
-        100 * rows[:, None] + np.arange(30),
-        3,
-        YearDataRecorded=2018,
-        DayOfYear=72,
-        HourOfDay=23,
-        MinuteOfHour=11,
-        SecondOfMinute=24 + rows // 4,
-        TRACE_SAMPLE_INTERVAL=100,
+        path, 100 * rows[:, None] + np.arange(30), 3, YearDataRecorded=2018, DayOfYear=72,
+        HourOfDay=23, MinuteOfHour=11, SecondOfMinute=24 + rows // 4, TRACE_SAMPLE_INTERVAL=100,
         DelayRecordingTime=20,
-    )
+    )  # fmt: skip
     return path
 
 
