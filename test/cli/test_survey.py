@@ -32,21 +32,15 @@ pytest.importorskip('pyarrow')
 
 SMALL = ('lines=3', 'cross_lines=1', 'spacing=25', 'length=80', 'ping_interval=0.7', 'ghost=false')
 PRODUCTS = (
-    'survey.tif',
-    'provenance.parquet',
-    'coverage.geojson',
-    'adjustment.json',
-    'crossings.csv',
+    'survey.tif', 'provenance.parquet', 'coverage.geojson', 'adjustment.json', 'crossings.csv',
     'report.html',
-)
+)  # fmt: skip
 
 
 RECORD = {
-    'system': 'bathymetry',
-    'bag': 'a.bag',
-    'topics': {},
+    'system': 'bathymetry', 'bag': 'a.bag', 'topics': {},
     'parameters': BathymetryConfig().as_dict(),
-}
+}  # fmt: skip
 
 
 def run(*arguments):

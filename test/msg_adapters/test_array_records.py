@@ -225,13 +225,9 @@ def test_a_dead_hydrophone_does_not_spoil_the_block():
 def test_traces_come_back_with_their_noise():
     depth = 120.0 + 0.25 * np.arange(80)
     trace = Trace(
-        stamp_ns=STAMP,
-        depth=depth,
-        amplitude=np.cos(depth),
-        sigma=np.full(80, 0.5),
-        frame_id='array',
-        reference_depth=0.0,
-    )
+        stamp_ns=STAMP, depth=depth, amplitude=np.cos(depth), sigma=np.full(80, 0.5),
+        frame_id='array', reference_depth=0.0,
+    )  # fmt: skip
     back = read_trace(write_trace(trace, ros_message))
     assert np.allclose(back.amplitude, trace.amplitude, atol=1e-7)
     assert (back.depth == depth).all() and (back.sigma == 0.5).all()

@@ -88,10 +88,14 @@ def test_a_pose_and_a_point_are_read():
         (block(-1.0, 0.0, 0.0, 4.0), None),
         (block(4.0, 0.0, 0.0, -1.0), None),
         (-np.eye(6), None),
+        (block(math.nan, 0.0, 0.0, 1.0), None),
+        (block(1.0, math.inf, math.inf, 1.0), None),
     ],
 )
-def test_zero_and_negative_covariances_are_unknown_and_only_zero_is_doubted(covariance, doubt):
-    assert read_fix(pose(covariance)).covariance is None
+def test_what_is_no_covariance_is_unknown_and_the_position_used(covariance, doubt):
+    """As in navigation and in NavSatFix; only zero is doubted."""
+    fix = read_fix(pose(covariance))
+    assert fix.covariance is None and fix.position[0] == 1.0
     assert doubt_fix(pose(covariance)) == doubt
 
 
@@ -165,16 +169,6 @@ def test_a_height_that_is_not_stated_or_cannot_be_true_is_left_out_alone(message
 )
 def test_what_cannot_be_used_is_refused_with_its_reason(message, code):
     assert reason(message) == code
-
-
-@pytest.mark.parametrize(
-    'flat',
-    [(math.nan, 0.0, 0.0, 1.0), (1.0, math.inf, math.inf, 1.0), (-1.0, 0.0, 0.0, 1.0), (0.0,) * 4],
-)
-def test_a_covariance_that_is_not_stated_is_unknown_and_the_position_used(flat):
-    """As in navigation and in NavSatFix."""
-    fix = read_fix(pose(block(*flat)))
-    assert fix.covariance is None and fix.position[0] == read_fix(pose()).position[0]
 
 
 def test_a_covariance_of_another_size_is_refused():
@@ -303,7 +297,8 @@ def test_latitude_0_longitude_0_is_no_fix(place, read):
     assert earth_reason(message, read) == 'no_fix'
 
 
-def test_a_covariance_of_nan_is_unknown():
+def test_a_covariance_of_nan_is_unknown_and_so_is_a_height():
+    assert np.isnan(read_geodetic(navsat(altitude=float('nan'))).height)
     assert read_geodetic(navsat(position_covariance=np.full(9, np.nan))).covariance is None
     flat = np.diag([1.0, 2.0, np.nan]).ravel()
     covariance = read_geodetic(navsat(position_covariance=flat)).covariance
@@ -333,10 +328,6 @@ def test_a_covariance_that_was_not_filled_in_is_unknown_and_doubted():
 )
 def test_what_is_no_position_is_refused(changes, expected):
     assert earth_reason(navsat(**changes)) == expected
-
-
-def test_height_may_be_unknown():
-    assert np.isnan(read_geodetic(navsat(altitude=float('nan'))).height)
 
 
 @pytest.mark.parametrize(
@@ -449,13 +440,8 @@ def test_north_east_down_is_turned():
         ({'covariance': np.eye(2) * 1e-20}, 'out_of_range'),
         ({'covariance': np.eye(2) * 1e20}, 'out_of_range'),
         ({'frame_id': 'map_ned'}, 'frame_ned'),
+        ({'stamp': ros_message('builtin_interfaces/msg/Time')}, 'bad_stamp'),
     ],
 )
 def test_a_start_that_cannot_be_used_is_refused(given, code):
     assert start_reason(start_message(**given)) == code
-
-
-def test_a_start_without_a_stamp_is_refused():
-    message = start_message()
-    message.header.stamp.sec = message.header.stamp.nanosec = 0
-    assert start_reason(message) == 'bad_stamp'

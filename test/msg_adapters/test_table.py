@@ -152,10 +152,6 @@ class TestDecode:
     def test_what_does_not_fit_is_refused_by_name(self, code, message):
         assert reason(message) == code
 
-    def test_a_field_is_named_in_the_sentence(self):
-        with pytest.raises(Rejection, match="'depth'.*beyond"):
-            decode_table(cloud([('depth', 4, 8, 1)], bytes(8), point_step=8))
-
 
 class TestEncode:
     def test_x_y_z_come_first_and_nothing_is_padded(self):
@@ -202,11 +198,8 @@ class TestEncode:
         for name in names:
             dtype = np.dtype(data.draw(st.sampled_from(FORMATS)))
             count = data.draw(st.integers(1, 3))
-            raw = data.draw(
-                st.binary(
-                    min_size=rows * count * dtype.itemsize, max_size=rows * count * dtype.itemsize
-                )
-            )
+            size = rows * count * dtype.itemsize
+            raw = data.draw(st.binary(min_size=size, max_size=size))
             shape = (rows,) if count == 1 else (rows, count)
             columns[name] = np.frombuffer(raw, dtype).reshape(shape)
         message = encode(columns)
@@ -236,15 +229,8 @@ def test_hostile_layouts_are_refused_or_read_within_their_bytes(sizes, count, da
         ('xyab'[rest[4 * i] % 4], rest[4 * i + 1], sizes[4 * i + 6] % 10, rest[4 * i + 3])
         for i in range(count)
     ]
-    message = cloud(
-        fields,
-        data,
-        height=height,
-        width=width,
-        point_step=point_step,
-        row_step=None if packed else row_step,
-        big=big,
-    )
+    shape = {'height': height, 'width': width, 'point_step': point_step}
+    message = cloud(fields, data, **shape, row_step=None if packed else row_step, big=big)
     try:
         columns = decode_table(message)
     except Rejection as rejection:
@@ -300,8 +286,9 @@ class TestBounds:
         assert list(columns) == ['a', 'c'] and columns['a'].tolist() == [0.0, 1.0, 2.0]
 
     def test_a_bad_field_is_named_even_where_it_is_not_wanted(self):
-        with pytest.raises(Rejection, match='beyond the point_step'):
-            decode_table(cloud([('a', 0, 8, 1), ('b', 8, 8, 1)], bytes(8), point_step=8), ('a',))
+        fields = [('a', 0, 8, 1), ('depth', 8, 8, 1)]
+        with pytest.raises(Rejection, match="'depth'.*beyond the point_step"):
+            decode_table(cloud(fields, bytes(8), point_step=8), ('a',))
 
     def test_too_many_rows_are_refused_before_the_data_are_looked_at(self):
         message = cloud([('a', 0, 8, 1)], None, width=11, point_step=8)

@@ -37,14 +37,9 @@ class Desk:
 
     def report(self, now, **changes):
         state = {
-            'enabled': True,
-            'stale_after': 5.0,
-            'counts': Counter(used=3),
-            'health': {'NIS': 1.5},
-            'lost': {},
-            'incompatible': {},
-            **changes,
-        }
+            'enabled': True, 'stale_after': 5.0, 'counts': Counter(used=3),
+            'health': {'NIS': 1.5}, 'lost': {}, 'incompatible': {}, **changes,
+        }  # fmt: skip
         message = self.reporter.report(Time(sec=9), now, **state)
         assert message.header.stamp.sec == 9
         self.input, self.tracker = message.status

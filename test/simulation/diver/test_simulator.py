@@ -59,12 +59,10 @@ def test_arrivals_are_transmitter_diver_receiver():
     config = scenario(
         'multistatic',
         {
-            'detection_probability': 1.0,
-            'outlier_probability': 0.0,
-            'toa_std': 1e-9,
+            'detection_probability': 1.0, 'outlier_probability': 0.0, 'toa_std': 1e-9,
             'duration': 5.0,
         },
-    )
+    )  # fmt: skip
     scene = simulate(config, 2)
     for item, place in zip(scene.measurements, scene.truth[0].position):
         path = np.linalg.norm(place - TRANSMITTER) + np.linalg.norm(place - RECEIVERS, axis=1)
@@ -198,12 +196,9 @@ def test_errors_of_arrival_times_are_independent_and_as_large_as_told():
 
 def test_receivers_miss_and_hear_reflections_each_for_itself():
     scene = run(
-        'multistatic',
-        detection_probability=0.6,
-        outlier_probability=0.2,
-        toa_std=1e-7,
+        'multistatic', detection_probability=0.6, outlier_probability=0.2, toa_std=1e-7,
         duration=1500.0,
-    )
+    )  # fmt: skip
     received, late = np.zeros(4), []
     for ping, (place,) in arrivals(scene):
         for receiver, toa in zip(ping.rx_id, ping.toa):
