@@ -11,6 +11,7 @@
 from types import SimpleNamespace
 
 from helpers import marine
+from helpers.refusals import reason
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -43,12 +44,6 @@ def header(stamp=100):
 
 def table(**columns):
     return encode_table(columns, stamp_ns=7, frame_id='sonar', make=ros_message)
-
-
-def reason(read, message, **options):
-    with pytest.raises(Rejection) as caught:
-        read(message, **options)
-    return caught.value.reason
 
 
 # -- our own table -----------------------------------------------------------------------------

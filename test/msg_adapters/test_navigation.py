@@ -11,6 +11,7 @@
 import math
 
 from helpers import marine
+from helpers.refusals import reason
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -51,12 +52,6 @@ def navigation(**values):
 
 def odometry(**values):
     return write_navigation(navigation(**values), ros_message)
-
-
-def reason(read, message, **options):
-    with pytest.raises(Rejection) as caught:
-        read(message, **options)
-    return caught.value.reason
 
 
 def test_writing_and_reading_gives_the_same_navigation():

@@ -9,6 +9,7 @@
 """Positions from transceivers: what each driver means, and what it flags."""
 
 from helpers.marine import driver_message
+from helpers.refusals import reason
 import numpy as np
 import pytest
 
@@ -25,12 +26,6 @@ from sonar_imm.measurements import NOBODY, Rejection, RelativeFix, VesselHeading
 from sonar_imm_tools.recordings.messages import ros_message
 
 STAMP = 7_000_000_000
-
-
-def reason(read, message):
-    with pytest.raises(Rejection) as caught:
-        read(message)
-    return caught.value.reason
 
 
 def modem(**values):

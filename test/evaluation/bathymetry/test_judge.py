@@ -10,21 +10,17 @@
 
 import json
 
+from helpers.commands import run
 import numpy as np
 import pytest
 
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.bathymetry import truth_topics
 from sonar_imm_tools.evaluation.bathymetry.figures import spectrum_figure
 from sonar_imm_tools.evaluation.bathymetry.profiles import profile_of
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope='module')
