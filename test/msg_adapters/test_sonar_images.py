@@ -192,10 +192,8 @@ def samples(values):
     [
         ({'intensity_quantity': AMPLITUDE, 'intensity_scale': LINEAR}, lambda a: a),
         ({'intensity_quantity': POWER, 'intensity_scale': LINEAR}, np.square),
-        (
-            {'intensity_quantity': POWER, 'intensity_scale': DECIBEL, 'scale': 0.25},
-            lambda a: 80.0 * np.log10(np.maximum(a, 0.1)),
-        ),
+        ({'intensity_quantity': POWER, 'intensity_scale': DECIBEL, 'scale': 0.25},
+         lambda a: 80.0 * np.log10(np.maximum(a, 0.1))),
         (
             {
                 'intensity_quantity': POWER,
@@ -206,7 +204,7 @@ def samples(values):
             lambda a: np.square(a) / 4.0 + 2.0,
         ),
     ],
-)
+)  # fmt: skip
 @pytest.mark.parametrize('stated', ['amplitude', 'decibel'])
 def test_what_the_sonar_says_of_a_sample_counts_in_place_of_the_parameters(
     fields, of_amplitude, stated
@@ -355,10 +353,8 @@ def test_the_whole_packet_of_an_oculus_is_read_from_its_end():
         ({'ping_data': np.zeros(0, np.uint8)}, 'short_data'),
         ({'step': 3, 'ping_data': np.zeros(24, np.uint8)}, 'short_data'),
         ({'step': 2**32 - 1}, 'short_data'),
-        (
-            {'n_ranges': 65535, 'n_beams': 65535, 'bearings': np.zeros(65535, np.int16)},
-            'too_large',
-        ),
+        ({'n_ranges': 65535, 'n_beams': 65535, 'bearings': np.zeros(65535, np.int16)},
+         'too_large'),
         ({'n_beams': 5}, 'bad_shape'),
         ({'bearings': np.zeros(0, np.int16)}, 'bad_shape'),
         ({'sample_size': 3}, 'bad_field'),
@@ -367,7 +363,7 @@ def test_the_whole_packet_of_an_oculus_is_read_from_its_end():
         ({'range_resolution': 0.0}, 'out_of_range'),
         ({'range_resolution': 1e300}, 'out_of_range'),
     ],
-)
+)  # fmt: skip
 def test_an_oculus_ping_that_cannot_be_is_refused(changes, code):
     assert refused(oculus(**changes)) == code
 

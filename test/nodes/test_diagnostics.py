@@ -173,23 +173,15 @@ def test_one_input_of_several_that_serve_is_enough(desk):
     'system, settings, required, one_of',
     [
         ('diver', {}, [], ['fix', 'fixes', 'relative', 'arrivals']),
-        (
-            'diver',
-            {'tags': ('amy',)},
-            [],
-            ['fix', 'amy/fix', 'fixes', 'relative', 'amy/relative', 'arrivals'],
-        ),
+        ('diver', {'tags': ('amy',)}, [],
+         ['fix', 'amy/fix', 'fixes', 'relative', 'amy/relative', 'arrivals']),
         ('obstacle', {}, ['detections', 'nav'], []),
         ('bathymetry', {}, [], ['snapshot', 'port/snapshot', 'starboard/snapshot']),
-        (
-            'bathymetry',
-            {'navigation': 'required'},
-            ['nav'],
-            ['snapshot', 'port/snapshot', 'starboard/snapshot'],
-        ),
+        ('bathymetry', {'navigation': 'required'}, ['nav'],
+         ['snapshot', 'port/snapshot', 'starboard/snapshot']),
         ('fathometer', {}, [], ['csdm', 'pressure', 'trace']),
     ],
-)
+)  # fmt: skip
 def test_what_each_system_needs(system, settings, required, one_of):
     assert needed(inputs_of(system), settings) == (required, one_of)
 
