@@ -30,11 +30,9 @@ def motion_case():
 
 def sea_config(case, **values):
     stated = {
-        'sonar_lever': case['lever'].tolist(),
-        'sonar_mount_rpy_deg': case['mount_deg'].tolist(),
-        'tilt_deg': float(case['tilt_deg']),
-        'side': str(case['side']),
-    }
+        'sonar_lever': case['lever'].tolist(), 'sonar_mount_rpy_deg': case['mount_deg'].tolist(),
+        'tilt_deg': float(case['tilt_deg']), 'side': str(case['side']),
+    }  # fmt: skip
     return BathymetryConfig(**{**EXACT, **stated, **values})
 
 
@@ -47,7 +45,7 @@ def navigation(case):
             frame_id='map',
         )
         for t, p, q in zip(case['tn'], case['pn'], case['qn'])
-    ]
+    ]  # fmt: skip
 
 
 def snapshots(case):

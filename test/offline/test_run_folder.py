@@ -12,6 +12,7 @@ import csv
 import json
 import re
 
+from helpers.commands import contents
 from helpers.dive_bags import write_dive
 from helpers.dive_scenes import single_run, START_NS
 import numpy as np
@@ -35,14 +36,6 @@ def folder(tmp_path):
     folder = RunFolder(tmp_path / 'run')
     folder.path.mkdir()
     return folder
-
-
-def contents(folder):
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in folder.rglob('*')
-        if path.is_file()
-    }
 
 
 def test_estimates_come_back_bit_for_bit(folder):
