@@ -9,6 +9,7 @@
 """Recordings of drivers whose packages are not installed, of vessels, tags and sensors."""
 
 import json
+import math
 
 from helpers.marine import driver_message, typestore
 import numpy as np
@@ -269,11 +270,11 @@ def test_far_from_all_fixes_there_is_no_place():
 
 def test_only_fixes_of_a_receiver_that_has_one_are_places(tmp_path):
     records = []
-    for k, status in enumerate((0, -1, 2, 0)):
+    for k, status in enumerate((0, -1, 2, 0, 0)):
         message = write_position((START + k) * SECOND, 10.0 + k, 59.0)
         message.status.status = status
         records.append(((START + k) * SECOND, '/position', message))
-    records[3][2].latitude = 91.0
+    records[3][2].latitude, records[4][2].longitude = 91.0, math.nan
     with BagReader(write_bag(tmp_path / 'bag', records)) as reader:
         found = read_positions(reader)
     assert found.stamp_ns.tolist() == [START * SECOND, (START + 2) * SECOND]
