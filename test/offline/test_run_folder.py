@@ -39,7 +39,11 @@ def folder(tmp_path):
 
 
 def test_estimates_come_back_bit_for_bit(folder):
-    assert folder.write_estimates(ESTIMATES, 'diver') == {'estimates': 20, 'rows': 20}
+    assert folder.write_estimates(ESTIMATES, 'diver') == {
+        'first_stamp_ns': ESTIMATES[0].stamp_ns,
+        'estimates': 20,
+        'rows': 20,
+    }
     for read, written in zip(folder.read_estimates(), ESTIMATES, strict=True):
         np.testing.assert_array_equal(read.state, written.state)
         np.testing.assert_array_equal(read.covariance, written.covariance)

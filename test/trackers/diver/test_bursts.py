@@ -12,12 +12,12 @@
 from pathlib import Path
 
 from attrs import evolve
-from helpers.diver_runs import SECOND
+from helpers.diver_runs import fix, SECOND
 import numpy as np
 import pytest
 
 from sonar_imm.estimation import bank
-from sonar_imm.measurements import Fix, Fixes
+from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver import bursts
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
@@ -114,13 +114,7 @@ def test_odds_of_the_two_readings():
 def fixes(t, z, R, **more):
     """Fixes z (n, 2) at t (n,), s."""
     for stamp, place, covariance in zip(t, z, R):
-        yield Fix(
-            stamp_ns=round((1.0 + stamp) * SECOND),
-            position=np.array([*place, 0.0]),
-            covariance=covariance,
-            frame_id='map',
-            **more,
-        )
+        yield evolve(fix(1.0 + stamp, *place, covariance), **more)
 
 
 def test_two_bursts_are_those_of_the_prototype():
