@@ -234,20 +234,3 @@ print(made.hexdigest(), *counts())
     loaded = run(code, cache, arguments=(str(start), 'c'))[0].split()
     assert loaded[1:] == ['0', '4']
     assert {loaded[0], *(each[0] for each in words)} == {loaded[0]}
-
-
-def test_numba_is_for_a_users_own_kernels_as_it_was():
-    code = """
-import sys, numba
-known = {name: module for name, module in sys.modules.items() if name.startswith('numba.')}
-def seen():
-    kinds = {kind for m in known.values() for kind in vars(m).values() if isinstance(kind, type)}
-    return {(kind, *each) for kind in kinds for each in vars(kind).items() if callable(each[1])}
-before = seen()
-import sonar_imm
-from sonar_imm.estimation import jit
-sonar_imm.IMM
-jit.kernel(lambda x: x + x)(2.0)
-print(len(before) > 1000, before == seen())
-"""
-    assert run(code, '')[0].split() == ['True', 'True']

@@ -30,14 +30,10 @@ def folder_of(tmp_path, estimates=(), **run):
     folder.write_json(
         'run.json',
         {
-            'system': 'diver',
-            'bag': str(tmp_path / 'dive'),
-            'counts': {},
-            'topics': {'/fix': 'fix'},
-            'parameters': {},
-            **run,
+            'system': 'diver', 'bag': str(tmp_path / 'dive'), 'counts': {},
+            'topics': {'/fix': 'fix'}, 'parameters': {}, **run,
         },
-    )
+    )  # fmt: skip
     return folder
 
 

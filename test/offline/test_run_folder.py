@@ -12,6 +12,7 @@ import csv
 import json
 import re
 
+from helpers.commands import contents
 from helpers.dive_bags import write_dive
 from helpers.dive_scenes import single_run, START_NS
 import numpy as np
@@ -37,16 +38,12 @@ def folder(tmp_path):
     return folder
 
 
-def contents(folder):
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in folder.rglob('*')
-        if path.is_file()
-    }
-
-
 def test_estimates_come_back_bit_for_bit(folder):
-    assert folder.write_estimates(ESTIMATES, 'diver') == {'estimates': 20, 'rows': 20}
+    assert folder.write_estimates(ESTIMATES, 'diver') == {
+        'first_stamp_ns': ESTIMATES[0].stamp_ns,
+        'estimates': 20,
+        'rows': 20,
+    }
     for read, written in zip(folder.read_estimates(), ESTIMATES, strict=True):
         np.testing.assert_array_equal(read.state, written.state)
         np.testing.assert_array_equal(read.covariance, written.covariance)

@@ -140,12 +140,9 @@ def test_a_driver_on_any_topic_is_suggested(tmp_path):
 def geo(k, topic='/fix', status=0, x=None, frame_id='gps'):
     place = ORIGIN.geodetic(np.array([0.7 * k if x is None else x, 5.0, 0.0]))
     fix = GeodeticFix(
-        stamp_ns=(START + k) * SECOND,
-        latitude=place[0],
-        longitude=place[1],
-        covariance=0.04 * np.eye(3),
-        frame_id=frame_id,
-    )
+        stamp_ns=(START + k) * SECOND, latitude=place[0], longitude=place[1],
+        covariance=0.04 * np.eye(3), frame_id=frame_id,
+    )  # fmt: skip
     message = write_geodetic(fix, ros_message)
     message.status.status = status
     return fix.stamp_ns, topic, message
@@ -175,11 +172,9 @@ def test_the_gps_of_a_vessel_is_not_taken_for_a_diver(tmp_path):
     def fix(k):
         position = (0.5 * k, 0.1, 0.0)
         item = Fix(
-            stamp_ns=(START + k) * SECOND,
-            position=position,
-            covariance=0.04 * np.eye(2),
+            stamp_ns=(START + k) * SECOND, position=position, covariance=0.04 * np.eye(2),
             frame_id='map',
-        )
+        )  # fmt: skip
         return item.stamp_ns, '/usbl/fix', write_fix(item, ros_message)
 
     records = [fix(k) for k in range(1, 10)] + [geo(k, '/gps/fix') for k in range(1, 10)]

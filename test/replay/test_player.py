@@ -69,12 +69,9 @@ def test_a_stretch_without_a_topic_and_with_another_quality_of_service(bag, link
     ear = Ear(link, PoseWithCovarianceStamped, '/fix')
     text = '/fix:\n  reliability: reliable\n  durability: transient_local\n  depth: 7\n'
     options = PlayOptions(
-        rate=100.0,
-        start_offset=0.05,
-        playback_duration=0.1,
-        exclude_topics=('/other',),
+        rate=100.0, start_offset=0.05, playback_duration=0.1, exclude_topics=('/other',),
         qos=profiles_of(text),
-    )
+    )  # fmt: skip
     with BagReader(bag) as reader, Link(NAME, domain_id=domain) as peer:
         player = Player(reader, peer, options)
         (publisher,) = player._publishers.values()
@@ -137,11 +134,9 @@ def test_a_loop_starts_over_with_the_recorded_stamps(bag, link, domain):
 
     with pytest.raises(Enough):
         play(
-            bag,
-            PlayOptions(loop=True, topics=('/fix',), rate=10.0),
-            domain_id=domain,
+            bag, PlayOptions(loop=True, topics=('/fix',), rate=10.0), domain_id=domain,
             progress=progress,
-        )
+        )  # fmt: skip
     assert ear.positions(COUNT + 4)[COUNT : COUNT + 3] == [0.0, 1.0, 2.0]
 
 

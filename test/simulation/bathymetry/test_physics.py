@@ -17,14 +17,9 @@ from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 TILT, SPACING, STAVES, NOISE = 37.0, 0.37, 5, 2.5
 ODD = {
-    'tilt_deg': TILT,
-    'spacing_wavelengths': SPACING,
-    'staves': STAVES,
-    'noise_variance': NOISE,
-    'sonar_height': 13.0,
-    'snr_near_db': 9.0,
-    'snr_far_db': 9.0,
-}
+    'tilt_deg': TILT, 'spacing_wavelengths': SPACING, 'staves': STAVES, 'noise_variance': NOISE,
+    'sonar_height': 13.0, 'snr_near_db': 9.0, 'snr_far_db': 9.0,
+}  # fmt: skip
 SIGNAL = NOISE * 10.0**0.9
 
 

@@ -31,14 +31,9 @@ from sonar_imm_tools.simulation.obstacle.simulator import (
 )
 
 EXACT = {
-    'ideal_navigation': True,
-    'sound_speed_error': 0.0,
-    'range_std': 0.0,
-    'bearing_std_deg': 0.0,
-    'range_step': 0.0,
-    'bearing_step_deg': 0.0,
-    'navigation_rate': 50.0,
-}
+    'ideal_navigation': True, 'sound_speed_error': 0.0, 'range_std': 0.0, 'bearing_std_deg': 0.0,
+    'range_step': 0.0, 'bearing_step_deg': 0.0, 'navigation_rate': 50.0,
+}  # fmt: skip
 
 
 def of(scene, kind):
@@ -125,14 +120,9 @@ def test_pings_are_lost_and_navigation_has_gaps():
 
 LEVER, MOUNT = np.array([1.3, -0.4, 0.7]), (4.0, -3.0, 6.0)
 TURNED = {
-    **EXACT,
-    'altitude_std': 0.0,
-    'sonar_lever': tuple(LEVER),
-    'sonar_mount_rpy_deg': MOUNT,
-    'course_deg': 70.0,
-    'roll_rms_deg': 4.0,
-    'vertical_offset': -4.0,
-}
+    **EXACT, 'altitude_std': 0.0, 'sonar_lever': tuple(LEVER), 'sonar_mount_rpy_deg': MOUNT,
+    'course_deg': 70.0, 'roll_rms_deg': 4.0, 'vertical_offset': -4.0,
+}  # fmt: skip
 
 
 def run(name='approach', seed=1, **overrides):
@@ -296,14 +286,9 @@ def test_false_echoes_fill_the_sector_evenly():
 # -- navigation -----------------------------------------------------------------------------------
 
 SILENT = {
-    'log_scale_error': 0.0,
-    'log_bias': 0.0,
-    'log_noise': 0.0,
-    'attitude_std_deg': 0.0,
-    'attitude_bias_deg': 0.0,
-    'yaw_bias_deg': 0.0,
-    'depth_std': 0.0,
-}
+    'log_scale_error': 0.0, 'log_bias': 0.0, 'log_noise': 0.0, 'attitude_std_deg': 0.0,
+    'attitude_bias_deg': 0.0, 'yaw_bias_deg': 0.0, 'depth_std': 0.0,
+}  # fmt: skip
 
 
 def path(seed, **errors):
