@@ -266,7 +266,7 @@ def test_every_system_is_found_by_its_name() -> None:
         assert issubclass(node_config_type(system), NodeConfig)
         scenes = importlib.import_module(system.scenes)
         assert scenes.SCENARIOS and callable(scenes.scenario) and callable(scenes.simulate)
-        assert callable(importlib.import_module(system.judge).judge)
+        assert callable(importlib.import_module(system.judge).scored)
         node = ROOT.joinpath(*system.node.split('.')).with_suffix('.py')  # importing needs rclpy
         assert '\ndef main(' in node.read_text(encoding='utf-8')
         assert list((ROOT / 'bags').glob(f'{name}_*')), f'no recording of {name} is shipped'
