@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 
+import llvmlite.binding as llvm
 import numba
 import pytest
 
@@ -130,6 +131,55 @@ def test_without_a_folder_that_can_be_written_each_process_compiles(tmp_path):
         out, errors, _ = run(code, os.devnull, **nowhere)
         assert out.split() == ['4.0', '1.0', '2', '0']
         assert errors.count('compiled kernels cannot be kept') == 1
+
+
+TARGET = Path(__file__).parents[2] / 'docker' / 'numba_target.sh'
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='images are of Linux')
+@pytest.mark.parametrize('anywhere', [False, True])
+def test_kernels_of_an_image_load_on_another_processor(tmp_path, anywhere):
+    """LLVM is made to find another processor; without the target, that one compiles anew."""
+    (tmp_path / 'alone.py').write_text(
+        'import sys\n'
+        'import llvmlite.binding as llvm\n'
+        'llvm.get_host_cpu_name = lambda: sys.argv[1]\n'
+        'from sonar_imm.estimation.jit import counts, kernel\n'
+        'def doubled(x): return 2.0 * x\n'
+        'print(kernel(doubled)(2.0), *counts())\n'
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.startswith('NUMBA_CPU')}
+    environment |= {'NUMBA_CACHE_DIR': str(tmp_path / 'kept'), 'PYTHONPATH': str(PACKAGE.parent)}
+    source = '. "$1"; ' if anywhere else ''
+    start = f'{source}exec "$2" "$3" "$4"'
+    found = []
+    for processor in (llvm.get_host_cpu_name(), 'x86-64'):
+        words = [
+            'sh',
+            '-ec',
+            start,
+            'sh',
+            TARGET,
+            sys.executable,
+            tmp_path / 'alone.py',
+            processor,
+        ]
+        done = subprocess.run(words, env=environment, capture_output=True, text=True)
+        found.append(done.stdout.split())
+    assert found == [['4.0', '1', '0'], ['4.0', '0', '1'] if anywhere else ['4.0', '1', '0']]
+
+
+def test_a_processor_that_was_chosen_stays():
+    words = [
+        'sh',
+        '-ec',
+        '. "$1"; echo "$NUMBA_CPU_NAME ${NUMBA_CPU_FEATURES-none}"',
+        'sh',
+        TARGET,
+    ]
+    environment = {**os.environ, 'NUMBA_CPU_NAME': 'skylake'}
+    environment.pop('NUMBA_CPU_FEATURES', None)
+    assert subprocess.check_output(words, env=environment, text=True) == 'skylake none\n'
 
 
 def test_a_helper_that_changes_changes_the_result(tmp_path):

@@ -31,7 +31,7 @@ def vector(name):
         'element_spacing_wavelengths': float(case['dlam']),
         'transition_matrix': case['Pi'].ravel().tolist(),
         'initial_probabilities': case['mu0'].tolist(), 'initial_std': float(case['sd0']),
-        'particles_per_model': 3000, 'shadow_gate': False, **EXACT,
+        'particles_per_model': 3000, 'gate_false_alarm': 1.0, **EXACT,
     }  # fmt: skip
     if name.startswith('set_ii_'):
         values |= {'model_set': 'height_two_rw', 'sigmas': case['sigmas'].tolist()}

@@ -254,6 +254,8 @@ def test_a_run_says_how_large_it_is_and_how_fast_it_was(tmp_path, capsys):
     assert there - own <= run['written_bytes'] <= there
     read = run['timings']['mb_per_s'] * run['timings']['wall_s']
     assert read == pytest.approx(run['bag_bytes'] * 1e-6)
+    p50, p99, total = (run['timings'][f'tracker_{name}_ms'] for name in ('p50', 'p99', 'total'))
+    assert 0.0 < p50 <= p99 <= total < 1e3 * run['timings']['wall_s']
     assert re.search(
         r'^  0\.\d+ MB read at \S+ MB/s, 0\.\d+ MB written$', capsys.readouterr().out, re.M
     )

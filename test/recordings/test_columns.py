@@ -13,12 +13,13 @@ import pytest
 
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.convert import KINDS
-from sonar_imm_tools.recordings.csv_table import CsvOptions, CsvTable
+from sonar_imm_tools.recordings.csv_table import CsvTable
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.places import Degrees
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.times import BadRow
 
 
@@ -30,6 +31,16 @@ def table(tmp_path):
         return CsvTable(path, CsvOptions(**options))
 
     return make
+
+
+def converted(folder, text, kind, *options):
+    """The measurements of a table; none where it is refused."""
+    (folder / 'in.csv').write_text(text, encoding='utf-8')
+    words = ['convert', kind, str(folder / 'in.csv'), str(folder / 'bag'), *options]
+    if main(words) != 0:
+        return []
+    with BagReader(folder / 'bag') as bag:
+        return [item.measurement for item in measurements_of(bag, 'diver')]
 
 
 @pytest.mark.parametrize(
@@ -91,6 +102,10 @@ def test_the_sign_of_a_hemisphere_is_no_northing(table):
         ('bearing', 'Peilung [°]', 180, 3.14159265),
         ('bearing', 'bearing', 0.5, 0.5),
         ('std_toa', 'std_toa_ms', 2, 0.002),
+        ('x', 'Est (pieds)', 10, 3.048),
+        ('x', 'East [yd]', 100, 91.44),
+        ('y', 'X (North)', 3, 3),
+        ('x', 'Y (Rechtswert)', 3, 3),
     ],
 )
 def test_units_of_headers_are_heeded(table, name, header, cell, value):
@@ -138,7 +153,15 @@ PLACES = [
     # an S of something else, and a diver of that name
     ('lat,lon,foo,mode,bar', '33,70,1,S,2\n2,33,70,1,N,3\n3,33,70,1,A,3', (33.0, 70.0)),
     ('name,lat,lon,id', 'S,33.5,70.25,E', (33.5, 70.25)),
-]
+    ('lat_deg,lat_min,lon_deg,lon_min', '-59,25.8,0,28.2', (-59.43, 0.47)),
+    ('lat_deg,lat_min,lon_deg,lon_min', '59,25.8,-0,28.2', (59.43, -0.47)),
+    ('Breite Grad,Breite Minuten,Länge Grad,Länge Minuten', '59,25.8,10,28.2', (59.43, 10.47)),
+    ('Lat Deg,Lat Min,Lat Sec,ns,Lon Deg,Lon Min,Lon Sec,ew', '59,25,48,S,10,28,12,W',
+     (-59.43, -10.47)),
+    ('Latitude (S),Longitude (°W)', '33.5,70.25', (-33.5, -70.25)),
+    ('Latitude (°S),Longitude (E+)', '33.5,-70.25', (-33.5, -70.25)),
+    ('Latitud (Norte),Longitud (Oeste)', '33.5,70.25', (33.5, -70.25)),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize('header, cells, place', PLACES)
@@ -448,3 +471,67 @@ def test_forms_that_were_found_out_are_said(tmp_path):
     assert notes['stamp of in.csv'] == 'Time is HHMMSS'
     assert notes['date of in.csv'] == 'Date is DMY'
     assert 'DDMM.MM' in notes['degrees']
+
+
+def test_units_in_a_row_below_the_headers(table):
+    made = table('time,x,bearing,depth (ft)\n(min),km,rad,m\n1.5,2,0.5,10\n')
+    (row,) = made
+    assert (row.number('x'), row.number('depth')) == (2000.0, pytest.approx(3.048))
+    assert row.stamp_ns() == 90 * 10**9
+    assert made.with_unit('bearing') == 'bearing [rad]'
+
+
+def test_a_row_of_words_that_are_no_units_is_a_row(table):
+    assert len(list(table('time,x,id\n1,2,km\n'))) == 1
+    assert len(list(table('time,x,status\nnone,none,bad\n1,2,ok\n'))) == 2
+
+
+def test_a_line_that_names_the_delimiter_is_none_of_the_table(table):
+    (row,) = table('sep=;\nZeit;x;y\n1;2,5;3\n')
+    assert row.number('x') == 2.5
+
+
+def test_void_fixes_of_nmea_are_left_out(table):
+    good, bad = table('time,x,y,status\n1,2,3,A\n2,2,3,V\n')
+    good.require_valid()
+    with pytest.raises(BadRow, match='flagged as invalid'):
+        bad.require_valid()
+
+
+def test_n_and_e_over_letters_are_hemispheres(tmp_path):
+    text = 'time,lat,N,lon,E\n1,33.5,S,70.25,W\n2,33.6,S,70.25,W\n'
+    assert converted(tmp_path, text, 'fixes')[1].position[1] == pytest.approx(-11_094, abs=10)
+
+
+def test_an_altitude_beside_a_depth_is_that_over_the_ground(tmp_path):
+    text = 'time,lat,lon,depth,altitude\n1,59.43,10.47,12.5,3.2\n'
+    (fix,) = converted(tmp_path, text, 'fixes')
+    assert fix.position == pytest.approx([0.0, 0.0, -12.5], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    'header, options, x',
+    [
+        ('slant range', [], 40.0),
+        ('Distance oblique (m)', [], 40.0),
+        ('range', ['--ranges', 'slant'], 40.0),
+        ('range', ['--ranges', 'horizontal'], 50.0),
+        ('horizontal range', [], 50.0),
+        ('range', [], None),
+    ],
+)
+def test_ranges_are_slant_or_horizontal_where_the_depth_matters(
+    tmp_path, capsys, header, options, x
+):
+    text = f'time,{header},bearing_deg,depth\n1,50,90,30\n2,50,90,30\n'
+    found = converted(tmp_path, text, 'fixes', '--bearings', 'north', *options)
+    if x is None:
+        assert found == []
+        assert 'say --ranges slant or --ranges horizontal' in capsys.readouterr().err
+    else:
+        assert found[0].position == pytest.approx([x, 0.0, -30.0])
+
+
+def test_a_depth_that_hardly_matters_is_no_question(tmp_path):
+    text = 'time,range,bearing_deg,depth\n1,50,90,3\n2,50,90,3\n'
+    assert converted(tmp_path, text, 'fixes')[0].position[0] == pytest.approx(50.0)

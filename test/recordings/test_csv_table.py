@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from sonar_imm_tools.recordings.csv_table import CsvOptions, CsvTable
+from sonar_imm_tools.recordings.csv_table import CsvTable
 from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.times import BadRow
 
 
@@ -53,7 +54,7 @@ def test_columns_mapped_by_hand_win(table):
     [
         ({'columns': {'x': 'eest'}}, "no column 'eest' (did you mean 'east'?)"),
         ({'columns': {'xx': 'east'}}, "no quantity 'xx'"),
-        ({'time_unit': 'min'}, 's, ms, us, ns'),
+        ({'time_unit': 'week'}, 's, ms, us, ns'),
     ],
 )
 def test_wrong_options_are_explained(table, options, words):

@@ -9,6 +9,7 @@
 """Recordings of drivers whose packages are not installed, of vessels, tags and sensors."""
 
 import json
+import math
 
 from helpers.marine import driver_message, typestore
 import numpy as np
@@ -26,7 +27,13 @@ from sonar_imm_tools.offline.inspection import inspect
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.offline.tracking import InputOptions, OfflineRun, write_run
 from sonar_imm_tools.recordings.messages import ros_message
-from sonar_imm_tools.recordings.positions import GAP_S, Positions, read_positions, write_position
+from sonar_imm_tools.recordings.positions import (
+    GAP_S,
+    Positions,
+    read_navigated,
+    read_positions,
+    write_position,
+)
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.topics import fitting_topics
 
@@ -273,3 +280,20 @@ def test_only_fixes_of_a_receiver_that_has_one_are_places(tmp_path):
         found = read_positions(reader)
     assert found.stamp_ns.tolist() == [START * SECOND, (START + 2) * SECOND]
     assert found.longitude.tolist() == [10.0, 12.0]
+
+
+def test_a_place_of_the_navigation_with_one_coordinate_is_none(tmp_path):
+    records = []
+    for k, (x, y) in enumerate(((1.0, 2.0), (3.0, math.nan), (math.nan, 4.0), (5.0, 6.0))):
+        header = ros_message(
+            'std_msgs/msg/Header',
+            stamp=ros_message('builtin_interfaces/msg/Time', sec=START + k, nanosec=0),
+            frame_id='map',
+        )
+        message = ros_message('nav_msgs/msg/Odometry', header=header)
+        message.pose.pose.position.x, message.pose.pose.position.y = x, y
+        records.append(((START + k) * SECOND, '/nav', message))
+    with BagReader(write_bag(tmp_path / 'bag', records)) as reader:
+        found = read_navigated(reader, lambda places: (places[:, 0], places[:, 1]))
+    assert found.stamp_ns.tolist() == [START * SECOND, (START + 3) * SECOND]
+    assert (found.longitude.tolist(), found.latitude.tolist()) == ([1.0, 5.0], [2.0, 6.0])

@@ -34,7 +34,7 @@ from sonar_imm_tools.replay import player as player_module
 from sonar_imm_tools.replay.harness import LockstepResult, reserved_domain_id, run_lockstep
 from sonar_imm_tools.replay.link import Link, LinkError
 from sonar_imm_tools.replay.lockstep import Counts
-from sonar_imm_tools.replay.player import NAME, Pace, play, Player, PlayOptions
+from sonar_imm_tools.replay.player import NAME, Pace, Pause, play, Player, PlayOptions
 
 
 @pytest.fixture
@@ -157,6 +157,16 @@ def test_a_paused_player_waits_for_resume(bag, link, domain):
     thread.join(120.0)
     assert results[0].published == COUNT + 1
     assert len(ear.positions(COUNT)) == COUNT
+
+
+def test_pause_and_resume_are_services(link):
+    pause = Pause(link, paused=False)
+    for name, paused, words in (('pause', True, 'paused'), ('resume', False, 'playing')):
+        client = link.node.create_client(Trigger, f'~/{name}')
+        assert link.wait_for(client.service_is_ready, 120.0)
+        future = client.call_async(Trigger.Request())
+        assert link.wait_for(future.done, 120.0)
+        assert (pause.paused, future.result().message) == (paused, words)
 
 
 @pytest.mark.parametrize(

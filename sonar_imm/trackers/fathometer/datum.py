@@ -8,14 +8,20 @@
 
 """How wrong the stated depth of the array is, as the reflectors show it together.
 
-An error e_t that is new in each record moves all reflectors by c_t = e_t - e_{t-1}, their mean
-change: successive changes then have the covariance -std^2. A slope or a wave adds a part that
-stays, whose successive products are positive; of the differences of c_t the same is -4 std^2 and
-hardly any slope. A fault of the floor is one change far from the others: such ones are left out,
-and the products that touch them. What is slow, or constant, cannot be told from the floor.
+All reflectors change from record t - 1 to t, as they are seen from the array that is told, by
 
-Where the error found is more than twice what is told, it is a part of the covariance at least;
-with ``heave: auto`` it becomes a state that all reflectors share, and they keep their ids.
+    c_t = g_t + w_t + e_t - e_{t-1},    g_t = g_{t-1} + u_t
+
+g a slope of the floor that bends, w a step of it, both of all layers together, and e the error
+of the array's depth, N(0, std^2), new in each record. How large each of the three is (`ERRORS`,
+`STEPS`, `BENDS`) is not known: a Kalman filter for each choice of them weighs it by the last
+`CHANGES`. A fault of the floor is one change that none of them explains (`_FAULT`). What an error
+does to c looks back: c_t and c_{t+1} have the covariance -std^2, where steps have none and slopes
+a positive one. An error that is slow, or constant, cannot be told from the floor.
+
+The error that is found, the root of the mean of std^2, counts in the covariance where it is more
+than what is told. Once it is far more, for sure, with ``heave: auto`` it becomes a state that all
+reflectors share, and they keep their ids.
 
 Jumps that are farther than slopes reach are counted: of a fault, or of a depth or a window that
 changed unsaid.
@@ -29,33 +35,47 @@ from typing import Annotated, ClassVar
 from attrs import define, evolve, field
 import numpy as np
 
-from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.arrays import FloatArray
 from .config import FathometerConfig
 from .reflectors import IdArray, Identities, Reflectors
 from .slopes import TURN_REACH
 
-CHANGES, LEAST, MOST = 40, 15, 1000.0
-_MAD, _FAR, _LEAST_FAR = 1.4826, 4.0, 0.08
-_TIMES, _LEAST_ERROR = 2.0, 0.05
+CHANGES, LEAST, LEAST_FOLLOWED, MOST = 40, 4, 8, 1000.0
+"""Changes that are remembered; how many it takes until the error counts, and until it is a
+state."""
+ERRORS = np.append(0.0, 0.02 * 2.0 ** (0.5 * np.arange(15)))
+STEPS, STEPS_PRIOR = np.array([0.01, 0.03, 0.1, 0.3, 1.0]), np.array([0.3, 0.3, 0.25, 0.1, 0.05])
+BENDS = np.array([0.003, 0.03, 0.1, 0.3, 1.0])
+"""Standard deviations, m; floors bend more often than all layers step together."""
+_RIGHT, _FAULT, _FAULT_DENSITY = 0.2, 0.005, 0.05
+"""Prior of no error at all; probability of a fault, and how dense its changes lie, 1/m."""
+_FIRST_SLOPE = 0.4
+_TIMES, _LEAST_ERROR, _SURE, _AGAIN = 2.0, 0.05, 0.9, 1.4
+_VARIANCES = np.square(ERRORS), np.square(STEPS), np.square(BENDS)
+_WRONG = np.append(_RIGHT, np.full(len(ERRORS) - 1, (1.0 - _RIGHT) / (len(ERRORS) - 1)))
+_PRIOR = np.multiply.outer(np.multiply.outer(_WRONG, STEPS_PRIOR), BENDS**0.0 / len(BENDS)).ravel()
 
 
 @define(eq=False)
 class DatumError:
     """Changes (n,) of depth, m, that reflectors of two records have in common. STATE: see
     `trackers.Tracker`. followed: standard deviation with which the error became a state, m;
-    _jumps: in how many records all jumped far, and _last, by how many m in the last of them."""
+    _heave: that was taken off the last record, m; _jumps: in how many records all jumped far, and
+    _last, by how many m in the last of them."""
 
-    STATE: ClassVar = ('_changes', 'followed', '_jumps', '_last')
+    STATE: ClassVar = ('_changes', 'followed', '_heave', '_jumps', '_last')
 
     _changes: Annotated[FloatArray, 'n'] = field(init=False, factory=lambda: np.empty(0))
     followed: float = field(init=False, default=0.0)
+    _heave: float = field(init=False, default=0.0)
     _jumps: int = field(init=False, default=0)
     _last: float = field(init=False, default=0.0)
+    _weights: FloatArray | None = field(init=False, default=None)
 
     def add(self, change: float) -> None:
-        """One more record; changes of a depth that is followed say nothing of its error."""
-        if not self.followed:
-            self._changes = np.append(self._changes[1 - CHANGES :], change)
+        """One more record; its change, as it is seen from the array that is told."""
+        self._changes = np.append(self._changes[1 - CHANGES :], change)
+        self._weights = None
 
     def note(
         self,
@@ -73,25 +93,45 @@ class DatumError:
         if abs(found.probable_jump) > TURN_REACH * config.slope_std and len(moved) > 1:
             self._jumps, self._last = self._jumps + 1, found.probable_jump
         if moved and array:
-            self.add(float(np.mean(moved)))
+            self.add(float(np.mean(moved)) + found.heave - self._heave)
+        self._heave = found.heave
 
     def require(self) -> None:
         """Raise ValueError where the state, which may come from a file, is impossible."""
         good = np.isfinite(self._changes).all() and 0.0 <= self.followed <= MOST
-        if not (good and self._jumps >= 0 and math.isfinite(self._last)):
+        numbers = self._last, self._heave
+        if not (good and self._jumps >= 0 and all(map(math.isfinite, numbers))):
             raise ValueError('no array is as deep as that')
+
+    @property
+    def weights(self) -> FloatArray:
+        """Posterior (15 + 1,) of `ERRORS`."""
+        if self._weights is None:
+            self._weights = error_weights(self._changes)
+        return self._weights
 
     @property
     def found(self) -> float:
         """Standard deviation, m; 0 while it is not known."""
-        if self.followed:
+        if len(self._changes) < LEAST:
             return self.followed
-        return min(found_std(self._changes), MOST) if len(self._changes) >= LEAST else 0.0
+        return math.sqrt(float(self.weights @ np.square(ERRORS)))
 
     def exceeds(self, config: FathometerConfig) -> bool:
-        """Whether the error is far greater than what is told."""
-        told = config.array_depth_std
-        return told > 0.0 and self.found > max(_TIMES * told, _LEAST_ERROR)
+        """Whether the error is far greater than what is told, for sure."""
+        if self.followed:
+            return True
+        least = max(_TIMES * config.array_depth_std, _LEAST_ERROR)
+        enough = config.array_depth_std > 0.0 and len(self._changes) >= LEAST_FOLLOWED
+        return enough and float(self.weights[least < ERRORS].sum()) > _SURE
+
+    def follow(self, config: FathometerConfig) -> bool:
+        """Make the error a state, or one of another size; whether that changes anything."""
+        found = self.found
+        if not self.exceeds(config) or self.followed / _AGAIN < found < self.followed * _AGAIN:
+            return False
+        self.followed = found
+        return True
 
     def effective(self, config: FathometerConfig) -> FathometerConfig:
         """`config` with the heave that is followed now."""
@@ -119,18 +159,23 @@ class DatumError:
         return found
 
 
-def found_std(changes: FloatArray) -> float:
-    """Standard deviation, m, of an error that is new in each record, from what reflectors change
-    by together (n,), m."""
-    off = np.abs(changes - np.median(changes))
-    usual = off <= max(_FAR * _MAD * float(np.median(off)), _LEAST_FAR)
-    variance = -_lagged(changes, usual)
-    if variance < 0.0:
-        variance = -0.25 * _lagged(np.diff(changes), usual[1:] & usual[:-1])
-    return math.sqrt(max(variance, 0.0))
-
-
-def _lagged(values: FloatArray, usual: BoolArray) -> float:
-    """Mean product of successive values (n,), both of them usual."""
-    both = usual[1:] & usual[:-1]
-    return float(np.mean((values[1:] * values[:-1])[both])) if both.any() else 0.0
+def error_weights(changes: FloatArray) -> FloatArray:
+    """Posterior (16,) of `ERRORS`, from what reflectors change by together (n,), m. The state of
+    each filter is the slope g and the last error e: their means, variances and covariance."""
+    e2, q2, b2 = (x.ravel() for x in np.meshgrid(*_VARIANCES, indexing='ij'))
+    log_weight = np.log(_PRIOR)
+    g, e, eg = np.zeros((3, len(e2)))
+    gg, ee = np.full(len(e2), _FIRST_SLOPE**2), e2
+    for change in changes:
+        gg = gg + b2
+        S = gg - 2.0 * eg + ee + e2 + q2
+        y = change - (g - e)
+        density = (1.0 - _FAULT) * np.exp(-0.5 * np.square(y) / S) / np.sqrt(2.0 * np.pi * S)
+        log_weight += np.log(density + _FAULT * _FAULT_DENSITY)
+        # Of a fault nothing is learned.
+        gain = np.where(density > _FAULT * _FAULT_DENSITY, 1.0 / S, 0.0)
+        to_g, to_e = (gg - eg) * gain, e2 * gain
+        g, e = g + to_g * y, to_e * y
+        gg, eg, ee = gg - np.square(to_g) * S, -to_g * to_e * S, e2 - np.square(to_e) * S
+    weight = np.exp(log_weight - log_weight.max()).reshape(len(ERRORS), -1).sum(axis=1)
+    return np.asarray(weight / weight.sum())

@@ -510,20 +510,20 @@ class FathometerTracker:
 
     def _follow_datum(self) -> None:
         """Make the error of the array's depth a state from the next record on, where it is far
-        greater than what is told. The reflectors keep their ids."""
+        greater than what is told, or than what is followed. The reflectors keep their ids."""
         datum, lattice = self._datum, self._lattice
-        if self.config.heave != 'auto' or datum.followed or not datum.exceeds(self.config):
-            return
         # What moves the floor of a profiler is its ship, which slopes follow.
-        if self._water.active or lattice is None:
+        if self.config.heave != 'auto' or self._water.active or lattice is None:
             return
-        datum.followed = datum.found
+        before = datum.followed
+        if not datum.follow(self.config):
+            return
         self._own = datum.effective(self.config)
         try:
             lattice.require(self._own)
             self._begin(lattice)
         except (ValueError, Rejection):
-            datum.followed = 0.0
+            datum.followed = before
             self._own = datum.effective(self.config)
             self._begin(lattice)
             return

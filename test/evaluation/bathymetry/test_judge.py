@@ -75,7 +75,7 @@ def test_without_truth_the_page_still_says_something(tracked, bag, tmp_path):
     'values',
     [
         {'model_set': 'angle_two_rw'},
-        {'model_set': 'height_bank', 'sigmas': '0.01'},
+        {'model_set': 'terrain'},
         {'model_set': 'height_rw_ncs'},
         {'model_set': 'height_two_rw', 'engine': 'grid', 'smoothing': 'states'},
     ],

@@ -85,6 +85,6 @@ def test_pings_meet_the_truth_of_their_own_stamp():
 def test_which_models_are_rough():
     assert rough_models(('rw', 'ncs')).tolist() == [True, False]
     assert rough_models(('rw_smooth', 'rw_rough')).tolist() == [False, True]
-    assert rough_models(('rw_1', 'rw_2', 'rw_3', 'rw_4')).tolist() == [False, False, True, True]
-    assert rough_models(('rw_1',)).tolist() == [False]
+    assert rough_models(('steady', 'winding', 'walk')).tolist() == [False, False, True]
+    assert rough_models(('rw_smooth',)).tolist() == [False]
     assert rough_models(()).tolist() == []

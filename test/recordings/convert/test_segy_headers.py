@@ -201,6 +201,12 @@ def test_times_that_are_utc_or_of_gps(tmp_path, base):
     assert zone == (TEN - {0: 3600, 5: 18}.get(base, 0)) * 10**9
 
 
+@pytest.mark.parametrize(('year', 'whole'), [(21, 2021), (98, 1998)])
+def test_years_of_two_digits(tmp_path, year, whole):
+    line = read_segy(write(tmp_path / 'line.sgy', year=year))
+    assert line.stamps == read_segy(write(tmp_path / 'line.sgy', year=whole)).stamps
+
+
 def test_seconds_between_gps_and_utc():
     moments = [
         datetime(*date, tzinfo=timezone.utc).timestamp()

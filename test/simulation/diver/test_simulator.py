@@ -366,3 +366,30 @@ def test_divers_who_cross_come_as_near_as_they_are_said_to(seed):
     paths = crossing_paths(6, np.linspace(0.0, 100.0, 2001), np.random.default_rng(seed))
     for first, other in zip(paths[::2], paths[1::2]):
         assert np.linalg.norm(first[:, :2] - other[:, :2], axis=1).min() < CLOSEST + 0.05
+
+
+def test_false_arrivals_come_after_the_direct_sound_and_within_the_range():
+    times = [
+        ping.toa * 1480.0 - np.linalg.norm(TRANSMITTER - RECEIVERS[ping.rx_id], axis=1)
+        for ping, _ in arrivals(
+            run(
+                'multistatic',
+                sound_speed=1480.0,
+                detection_probability=0.0,
+                clutter=20.0,
+                clutter_range=30.0,
+                duration=30.0,
+            )
+        )
+    ]
+    late = np.concatenate(times)
+    assert len(late) > 1000 and 0.0 <= late.min() < 3.0 and 57.0 < late.max() <= 60.0
+
+
+def test_reflections_are_five_to_fifty_metres_late():
+    clean = {'detection_probability': 1.0, 'outlier_probability': 1.0, 'toa_std': 1e-9}
+    late = []
+    for ping, (place,) in arrivals(run('multistatic', sound_speed=1480.0, duration=60.0, **clean)):
+        path = np.linalg.norm(place - TRANSMITTER) + np.linalg.norm(place - RECEIVERS, axis=1)
+        late += (ping.toa * 1480.0 - path).tolist()
+    assert 5.0 <= min(late) < 8.0 and 47.0 < max(late) <= 50.0

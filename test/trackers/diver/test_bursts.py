@@ -249,6 +249,26 @@ def test_a_burst_that_follows_another_one_takes_no_identity():
     assert all(confirmed(each)[0] == ids for each in made[40:])
 
 
+def test_a_burst_excludes_a_track_though_its_second_fix_is_missing():
+    """The track that the first fix begins does not end before the burst, or a new target would be
+    lost to it."""
+    t = np.arange(60.0)
+    truth = np.column_stack([0.5 * t - 20.0, 0.0 * t])[:, None]
+    seen = truth.copy()
+    seen[40:48, 0] += [15.0, -20.0]
+    seen[41, 0] = np.nan
+    tracker, excluded = DiverTracker(DiverConfig()), 0
+    for scan in scans(seen, seed=1):
+        made = tracker.process(scan)[-1]
+        known = tracker._stream.state
+        link = known.rows.key['link']
+        assert np.isin(link[link != 0], known.life.track_id).all()
+        excluded += (link > 0).any()
+    assert excluded >= 8
+    _, (place,) = confirmed(made)
+    assert np.hypot(*(place - truth[-1, 0])) < 3.0
+
+
 def test_two_false_fixes_that_agree_are_not_said():
     t = np.arange(60.0)
     truth = np.column_stack([0.5 * t - 20.0, 0.0 * t])[:, None]
