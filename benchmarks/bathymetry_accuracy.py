@@ -44,10 +44,11 @@ GRID: dict[str, Any] = {'engine': 'grid'}
 
 # Name: parameters that differ from `COMMON`, and smooth, patch, all (m), angle (deg), overlap as
 # found before by an independent prototype; None where it was not measured.
-COMMON: dict[str, Any] = {**WALKS, 'shadow_gate': False, 'initial_std': 1.0}
+COMMON: dict[str, Any] = {**WALKS, 'gate_false_alarm': 1.0, 'initial_std': 1.0}
+GATED: dict[str, Any] = {'gate_false_alarm': 1e-3, 'initial_std': 0.0}
 TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
     'random walk only': (
-        {'model_set': 'height_bank', 'sigmas': (1.0,), 'engine': 'particles'},
+        {**TWO, 'transition_matrix': (1.0, 0.0, 0.0, 1.0), 'initial_probabilities': (0.0, 1.0)},
         (0.401, 0.331, 0.391, 0.41, None),
     ),
     'constant slope only': ({**SLOPE_SET, **SLOPES_ONLY}, (0.119, 0.499, 0.231, 0.30, None)),
@@ -73,23 +74,13 @@ TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
         {**QUICK, **GRID, 'smoothing': 'states'},
         (0.036, 0.302, 0.128, None, 0.90),
     ),
-    'height_bank': (
-        {
-            'model_set': 'height_bank',
-            'sigmas': (0.01, 0.05, 0.3, 1.5),
-            'rough_sigma': 0.3,
-            'engine': 'particles',
-            'stay_probability': 0.995,
-        },
-        (None,) * 5,
-    ),
     'angle_two_rw': (
         {'model_set': 'angle_two_rw', 'initial_std': 0.0, 'angle_drift': False},
         (None,) * 5,
     ),
-    'height_two_rw, gate': ({'shadow_gate': True, 'initial_std': 0.0}, (None,) * 5),
+    'height_two_rw, gate': (GATED, (None,) * 5),
     'defaults': (
-        {'model_set': 'terrain', 'shadow_gate': True, 'initial_std': 0.0},
+        {'model_set': 'terrain', **GATED},
         (None,) * 5,
     ),
 }

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Floors of all kinds, by `terrain`, the walks and the banks, on the same pings.
+"""Floors of all kinds, by `terrain` and by walks, on the same pings.
 
     python -m benchmarks.bathymetry_floors --out docs/results/bathymetry_floors.json
 
@@ -14,9 +14,12 @@ An array of eight staves 15 m above the reference floor, 30 to 10 dB, 1200 bins 
 where there is one, is 10 m long. Prints RMSE of the height over all valid bins and inside of the
 patch (m), the share of heights within two standard deviations, the same inside of the patch, the
 overlap of the patch with the bins called rough, or, without a patch, the share of bins called
-rough. `worst`: the smallest share within two standard deviations of a single ping. `microseconds`:
-CPU time of a bin, all methods in turn on each ping. `calibration`: of `terrain`, the bins of all
-floors by their probability of rough floor, the mean of it and the share that is rough.
+rough; of `terrain` both also with `winding` floor counted as rough (`_either`), which roughness
+correlated over metres is as well, and the share of the patch and of the rest that is told smooth
+(`told_smooth_patch`, `told_smooth`). `worst`: the smallest share within two standard deviations of
+a single ping. `microseconds`: CPU time of a bin, all methods in turn on each ping. `calibration`:
+of `terrain`, the bins of all floors by their probability of rough floor, the mean of it and the
+share that is rough.
 
 `arrays`: `terrain` on the floor `white .5`, with errors of the array in its samples, as they are
 and measured from the echoes, mean over arrays with the fault at other staves; `used`: share of the
@@ -53,9 +56,6 @@ METHODS: dict[str, dict[str, Any]] = {
         'sigmas': (0.01, 1.0),
         'transition_matrix': (0.98, 0.02, 0.02, 0.98),
     },
-}
-BANKS: dict[str, dict[str, Any]] = {
-    name: {'model_set': name} for name in ('height_bank', 'scatter_bank')
 }
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
 Shape = Callable[[FloatArray], FloatArray]
@@ -219,12 +219,15 @@ class Scores:
         table = estimate.columns()
         used = (table['valid'] > 0) & truth.valid
         rough = table['rough'] if 'rough' in table else table['prob_rw_rough']
+        either = rough + table.get('prob_winding', 0.0)
         error = (table['height'] - truth.height)[used]
         self.pings.append(
             {
                 'error': error,
                 'inside': np.abs(error) < 2.0 * np.sqrt(table['cov_height_height'][used]),
                 'rough': rough[used],
+                'either': either[used],
+                'smooth': table['told'][used] == 0,
                 'patch': truth.patch[used],
             }
         )
@@ -235,6 +238,7 @@ class Scores:
     def row(self) -> dict[str, float | None]:
         error, inside, patch = (self.whole(name) for name in ('error', 'inside', 'patch'))
         rough, there = self.whole('rough') > 0.5, bool(patch.any())
+        either, smooth = self.whole('either') > 0.5, self.whole('smooth')
         return {
             'rmse': float(np.sqrt(np.mean(np.square(error)))),
             'inside': float(inside.mean()),
@@ -242,7 +246,13 @@ class Scores:
             'rmse_patch': float(np.sqrt(np.mean(np.square(error[patch])))) if there else None,
             'inside_patch': float(inside[patch].mean()) if there else None,
             'overlap': float((rough & patch).sum() / (rough | patch).sum()) if there else None,
+            'overlap_either': float((either & patch).sum() / (either | patch).sum())
+            if there
+            else None,
             'called_rough': None if there else float(rough.mean()),
+            'called_either': None if there else float(either.mean()),
+            'told_smooth': float(smooth[~patch].mean()),
+            'told_smooth_patch': float(smooth[patch].mean()) if there else None,
             'microseconds': 1e6 * self.seconds / self.bins,
         }
 
@@ -294,13 +304,10 @@ def arrays(pings: int, seed: int, others: int) -> Parts:
             yield {'arrays': {f'{fault}, {name}': row}}
 
 
-def main(pings: int = 10, seed: int = 1, banks: bool = False, array_seeds: int = 5) -> Parts:
+def main(pings: int = 10, seed: int = 1, array_seeds: int = 5) -> Parts:
     yield {'pings': pings, 'seed': seed}
     yield from arrays(max(pings // 2, 5), 1000 + seed, array_seeds)
-    methods = {
-        name: BathymetryConfig(**EXACT_ARRAY, **values)
-        for name, values in (METHODS | (BANKS if banks else {})).items()
-    }
+    methods = {name: BathymetryConfig(**EXACT_ARRAY, **values) for name, values in METHODS.items()}
     for config in methods.values():
         BathymetryTracker(config).warm()
     of_terrain = []

@@ -50,7 +50,7 @@ WALKS: dict[str, Any] = {'model_set': 'height_two_rw', **EXACT_ARRAY}
 PRINTED: dict[str, Any] = {
     **WALKS,
     'stay_probability': 0.98,
-    'shadow_gate': False,
+    'gate_false_alarm': 1.0,
     'layover': 'ignored',
     'angle_drift': False,
     'redrawn_slope_std': 0.0,
@@ -116,7 +116,6 @@ CASES: dict[str, Case] = {
     'roughness fractal': Case('paper', {'roughness_law': 'fractal'}, {}),
     'echoes with heavier tails': Case('paper', {'law': 'k'}, {}),
     'all three, fractal': Case('foreign', {}, {}),
-    'all three, fractal, bank': Case('foreign', {}, {'model_set': 'height_bank'}),
     'all three, fractal, terrain': Case('foreign', {}, {'model_set': 'terrain'}),
 }
 

@@ -23,15 +23,7 @@ from benchmarks.bathymetry_accuracy import PAPER_CHAIN, SLOPE_SET, SLOPES_ONLY
 from benchmarks.bathymetry_paper import Case, judged, PRINTED, PrintedTracker
 from benchmarks.study import Parts, Row, study
 
-BANK: dict[str, Any] = {
-    'model_set': 'height_bank',
-    'sigmas': (0.01, 0.05, 0.3, 1.5),
-    'rough_sigma': 0.3,
-    'engine': 'particles',
-    'stay_probability': 0.995,
-}
-"""The coarse bank; for the default one see `bathymetry_sea`."""
-OPEN: dict[str, Any] = {'shadow_gate': False}
+OPEN: dict[str, Any] = {'gate_false_alarm': 1.0}
 SLOPE: dict[str, Any] = {**OPEN, **SLOPE_SET, **SLOPES_ONLY}
 FLAT: dict[str, Any] = {'patch_std': 0.0, 'slope': 0.1}
 
@@ -65,7 +57,7 @@ CASES: dict[str, Case] = {
     'Gaussian echoes, Gaussian law': Case('gaussian', {}, {'likelihood': 'gaussian'}),
     'Laplace echoes, Gaussian law': Case('paper', {}, {'likelihood': 'gaussian'}),
     'undulating, two walks': Case('undulating', {}, {}),
-    'undulating, bank': Case('undulating', {}, BANK),
+    'undulating, terrain': Case('undulating', {}, {'model_set': 'terrain'}),
     'roughness correlated, .01 and 1 m': Case('correlated', {}, {'sigmas': (0.01, 1.0)}),
     'roughness correlated, defaults': Case('correlated', {}, {}),
     'roughness correlated, .01 and .15 m': Case('correlated', {}, {'sigmas': (0.01, 0.15)}),

@@ -33,7 +33,7 @@ from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 APART: dict[str, Any] = {'ping_rate': 0.3, 'patch_along': []}
 GRID: dict[str, Any] = {'engine': 'grid'}
 ANGLES: dict[str, Any] = {'model_set': 'angle_two_rw'}
-BANK: dict[str, Any] = {'model_set': 'height_bank'}
+TERRAIN: dict[str, Any] = {'model_set': 'terrain'}
 NADIR: dict[str, Any] = {'first_range': 15.1}
 LOST = 1.0
 """Metres of RMSE from which a ping is lost."""
@@ -54,6 +54,7 @@ STATED: dict[str, Any] = {'sonar_height': 15.0, 'sonar_height_std': 5.0}
 
 # Name: scenario, what it changes, parameters beside those of the instruments.
 CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    'motion, terrain': ('moving', APART, TERRAIN),
     'motion, grid': ('moving', APART, GRID),
     'motion, particles': ('moving', APART, {}),
     'motion, forward-backward': ('moving', APART, {**GRID, 'smoothing': 'states'}),
@@ -63,9 +64,11 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
         APART,
         {**GRID, 'sonar_lever': [0, 0, 0], 'sonar_mount_rpy_deg': [0, 0, 0]},
     ),
+    'summer profile, terrain': ('moving_profile', APART, TERRAIN),
     'summer profile, grid': ('moving_profile', APART, GRID),
     'summer profile, particles': ('moving_profile', APART, {}),
     'summer profile ignored': ('moving_profile', APART, {**GRID, 'sound_speed_profile': []}),
+    'height 10 m, told 15, terrain': ('moving', unknown(10.0), {**STATED, **TERRAIN}),
     'height 10 m, told 15, grid': ('moving', unknown(10.0), {**STATED, **GRID}),
     'height 10 m, told 15, particles': ('moving', unknown(10.0), STATED),
     'height 10 m, told 10, grid': (
@@ -93,6 +96,7 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
         {**unknown(15.0), **EXACT_NAVIGATION},
         {**STATED, **GRID},
     ),
+    'height 20 m, told 15, terrain': ('moving', unknown(20.0), {**STATED, **TERRAIN}),
     'height 20 m, told 15, grid': ('moving', unknown(20.0), {**STATED, **GRID}),
     'height 20 m, told 15, particles': ('moving', unknown(20.0), STATED),
     'nadir, angles, drift, grid': ('paper', NADIR, {**ANGLES, **GRID}),
@@ -104,32 +108,32 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
         NADIR,
         {**ANGLES, **GRID, 'sigmas_deg': [0.03, 0.1, 2.0]},
     ),
+    'nadir, terrain': ('paper', NADIR, TERRAIN),
     'nadir, heights': ('paper', NADIR, GRID),
     'labels, white, two walks': ('paper', {}, GRID),
-    'labels, white, bank': ('paper', {}, BANK),
+    'labels, white, terrain': ('paper', {}, TERRAIN),
     'labels, Gaussian .3 m, two walks': ('correlated', {'correlation_length': 0.3}, GRID),
-    'labels, Gaussian .3 m, bank': ('correlated', {'correlation_length': 0.3}, BANK),
+    'labels, Gaussian .3 m, terrain': ('correlated', {'correlation_length': 0.3}, TERRAIN),
     'labels, Gaussian 1 m, two walks': ('correlated', {}, GRID),
-    'labels, Gaussian 1 m, bank': ('correlated', {}, BANK),
-    'labels, Gaussian 1 m, .003 .05 .5': (
-        'correlated',
-        {},
-        {**BANK, 'sigmas': [0.003, 0.05, 0.5], 'rough_sigma': 0.05},
-    ),
-    'labels, undulation .5 m in 15 m, bank': ('undulating', {}, BANK),
-    'labels, undulation .2 m in 20 m, bank': (
+    'labels, Gaussian 1 m, terrain': ('correlated', {}, TERRAIN),
+    'labels, undulation .5 m in 15 m, terrain': ('undulating', {}, TERRAIN),
+    'labels, undulation .2 m in 20 m, terrain': (
         'undulating',
         {'undulation_height': 0.2, 'undulation_length': 20.0},
-        BANK,
+        TERRAIN,
     ),
-    'labels, slope .1, bank': ('slope', {}, BANK),
-    'labels, slope .05, bank': ('slope', {'slope': 0.05}, BANK),
-    'labels, slope .07, bank': ('slope', {'slope': 0.07}, BANK),
-    'labels, slope .1, bank, 30 dB everywhere': ('slope', LOUD, BANK),
-    'labels, undulation .5 m in 15 m, bank, 30 dB everywhere': ('undulating', LOUD, BANK),
+    'labels, slope .1, terrain': ('slope', {}, TERRAIN),
+    'labels, slope .05, terrain': ('slope', {'slope': 0.05}, TERRAIN),
+    'labels, slope .07, terrain': ('slope', {'slope': 0.07}, TERRAIN),
+    'labels, slope .1, terrain, 30 dB everywhere': ('slope', LOUD, TERRAIN),
+    'labels, undulation .5 m in 15 m, terrain, 30 dB everywhere': ('undulating', LOUD, TERRAIN),
     **{
         f'coupling {strength:g}': ('moving', {}, {**EXACT, 'ping_coupling': strength})
         for strength in (0.0, 0.15, 0.35, 0.7)
+    },
+    **{
+        f'coupling {strength:g}, terrain': ('moving', {}, {**TERRAIN, 'ping_coupling': strength})
+        for strength in (0.0, 0.15)
     },
     **{
         f'staves 2, {spacing:g} wavelengths, {share:.0%} differ, told {stated:.0%}': (

@@ -28,8 +28,11 @@ counts tracks that follow nothing for more than half of their pings, in an hour.
 median time from the first ping in the beam to a confirmed track, s, infinite where it was none;
 `place` the mean distance in the plane, m; `P` the mean probability of the true behaviour after 27
 s. `offset`, `NEES` and `band` are of the vertical offset between 60 and 40, and 40 and 25 m.
-`said`: share of the encounters after which users are told of a drift or of late poses; `good`:
-median of `navigation_good` at the end.
+Pings of one encounter err alike: `band se` is the standard error of the band by encounters.
+Encounters of one seed are the same but for what a scene names, so `fixed, +3 m` is `30 false`, and
+`P_D .3` is `P_D .3, 5 false`, told which echoes are the obstacle's.
+`said`: share of the encounters after which users are told of errors of the navigation, or that
+obstacles move alike; `good`: median of `navigation_good` at the end.
 
 `reliability` compares what is stated with what is true, by bins of what is stated, over all rows
 that are published of all scenes of a run: `existence`, of tentative tracks too, true where a real
@@ -239,6 +242,7 @@ SCENES: dict[str, tuple[Sequence[tuple[str, dict[str, Any]]], Change | None]] = 
         [('approach', {})],
         false_ones(12.0, 1.0, 100.0, -np.radians(16.0), -np.radians(10.0)),
     ),
+    'P_D .3': ([('approach', {'detection_probability': 0.3})], None),
     'P_D .3, 5 false': (
         [('approach', {'detection_probability': 0.3})],
         false_ones(5.0, 1.0, 100.0),
@@ -251,6 +255,8 @@ SCENES: dict[str, tuple[Sequence[tuple[str, dict[str, Any]]], Change | None]] = 
     'drift .02': ([('approach', {})], drifting(0.02)),
     'drift .05': ([('approach', {})], drifting(0.05)),
     'drift .05, 4 fixed': ([('approach', {**FIELD, 'obstacles': 4})], drifting(0.05)),
+    'drift .3': ([('approach', {})], drifting(0.3)),
+    'drift .3, 4 fixed': ([('approach', {**FIELD, 'obstacles': 4})], drifting(0.3)),
     'yaw 2 deg': ([('approach', {})], turned(2.0)),
     '.5 s late': ([('approach', {})], late(0.5)),
     '1.5 s late': ([('approach', {})], late(1.5)),
@@ -313,6 +319,7 @@ class Sums:
         self.place: list[float] = []
         self.behaviour: dict[str, list[float]] = {}
         self.offset: list[list[tuple[float, float, float]]] = [[] for _ in BANDS]
+        self.held: list[list[float]] = [[] for _ in BANDS]
         self.switches = 0
         self.existence: list[tuple[float, bool]] = []
         self.stated: list[tuple[float, bool]] = []
@@ -324,6 +331,7 @@ class Sums:
         confirmed: dict[int, float] = {}
         follows: dict[int, list[bool]] = {}
         last_id: dict[int, int] = {}
+        before = [len(rows) for rows in self.offset]
         for ping, stamp in enumerate(stamps.tolist()):
             estimate = final.get(stamp)
             if estimate is None:
@@ -358,6 +366,9 @@ class Sums:
                 self.switches += last_id.get(k, track) != track
                 last_id[k] = track
                 self._add_row(estimate, int(rows[j]), obstacles[k], ping, t)
+        for held, offsets, start in zip(self.held, self.offset, before):
+            if new := offsets[start:]:
+                held.append(float(np.mean([inside for *_, inside in new])))
         self.confirm += [confirmed.get(k, np.inf) for k in range(len(obstacles))]
         self.false_ids += sum(1 for each in follows.values() if np.mean(each) < 0.5)
         self.seconds += (stamps[-1] - stamps[0]) * 1e-9
@@ -396,7 +407,7 @@ class Sums:
             'place': float(np.mean(self.place)) if self.place else np.nan,
             **{f'P {does}': float(np.mean(p)) for does, p in self.behaviour.items()},
         }
-        for (far, near), rows in zip(BANDS, self.offset):
+        for (far, near), rows, held in zip(BANDS, self.offset, self.held):
             error, nees, inside = np.array(rows or [(np.nan,) * 3]).T
             name = f'{far:.0f}-{near:.0f}'
             found |= {
@@ -404,6 +415,8 @@ class Sums:
                 f'NEES {name}': float(nees.mean()),
                 f'band {name}': float(inside.mean()),
             }
+            if len(held) > 1:
+                found[f'band se {name}'] = float(np.std(held, ddof=1) / np.sqrt(len(held)))
         return {**found, 'switches': float(self.switches)}
 
 
@@ -431,7 +444,10 @@ def scene(name: str, belief: str, runs: int, first: int = 0) -> tuple[dict[str, 
         tracker = ObstacleTracker(config)
         sums.add(final_estimates(tracker, given), obstacles)
         good.append(tracker.health()['navigation_good'])
-        said += any('navigation drifts' in each or 'poses' in each for each in tracker.warnings())
+        words = 'navigation drifts', 'poses', 'seems to be turned'
+        said += bool(tracker.health()['pings_moving_alike']) or any(
+            word in each for each in tracker.warnings() for word in words
+        )
     row = {'runs': runs, **sums.row(), 'said': said / runs}
     known = [value for value in good if np.isfinite(value)]
     return row | ({'good': float(np.median(known))} if known else {}), sums

@@ -95,8 +95,9 @@ GONE: dict[str, str] = {
             *('ground_std', 'ground_radius', 'max_offset', 'altitude_std'),
             *('max_altitude_age', 'scale_std', 'course_window', 'landmark_time'),
             'max_navigation_gap',
-            *('sigma_reference_bin', 'rough_sigma', 'scatters', 'grid_step', 'grid_extent'),
+            *('sigma_reference_bin', 'grid_step', 'grid_extent'),
             *('initial_slope_std', 'redrawn_slope_std', 'multipath_level_db', 'likelihood'),
+            *('initial_mean', 'initial_std'),
             'max_extrapolation',
             *('array_depth_age', 'heave_memory', 'white_noise_gain_db', 'depth_step'),
             *('slope_switch_probability', 'negative_probability', 'amplitude_memory'),
@@ -127,6 +128,18 @@ GONE: dict[str, str] = {
     },
     'parameter hypotheses': 'was removed together with association: kbest',
     'parameter named_tracks': 'was removed: a track with a name also takes fixes without one',
+    **{
+        f'choice model_set {name}': (
+            'was removed: terrain, the default, maps these floors; what this set called rough is '
+            'rough + prob_winding there'
+        )
+        for name in ('height_bank', 'scatter_bank')
+    },
+    'parameter shadow_gate': 'was removed: 1 is no gate (parameter gate_false_alarm)',
+    **{
+        f'parameter {name}': 'was removed: terrain, the default, has models of rough floor'
+        for name in ('rough_sigma', 'scatters')
+    },
     'choice association kbest': (
         'was removed: jipda, the default, weighs all joint events of a scan exactly'
     ),

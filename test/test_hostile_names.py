@@ -25,7 +25,8 @@ from rich.console import Console
 
 from msg_adapters.fixes import write_fix
 from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import Fix
+from sonar_imm.measurements import Fix, Rejection
+from sonar_imm.texts import in_one_line, visible
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.cli.common import warn
 from sonar_imm_tools.evaluation.plotting import plain_content
@@ -60,6 +61,18 @@ def estimate(model):
         probabilities=np.ones((2, 1)),
         extras={'track_id': np.arange(2, dtype='u4'), 'track_state': np.ones(2, 'u1')},
     )
+
+
+def test_what_would_steer_a_terminal_is_shown():
+    assert visible('a\x1b[2Jb\x07\x9b\u202ec\r') == 'a\\x1b[2Jb\\x07\\x9b\\u202ec\\r'
+    assert visible('Zoë, 5 m²\n\tend') == 'Zoë, 5 m²\n\tend'
+
+
+def test_a_sentence_is_one_line_and_has_an_end():
+    assert in_one_line('a\nb\r\nc\td') == 'a b c d'
+    assert len(in_one_line('x' * 10**6)) < 1100
+    rejection = Rejection('frame', "the frame 'a\n\x1b[31mb'")
+    assert rejection.sentence == str(rejection) == "the frame 'a \\x1b[31mb'"
 
 
 @pytest.mark.parametrize('text', [*FORMULAS, ' =1', '\n=1', '\uff1d1', '-', '-1\t'])

@@ -95,14 +95,6 @@ def test_files_and_tests_named_on_pages_exist() -> None:
     assert missing == set()
 
 
-def test_no_page_is_long() -> None:
-    words = {
-        path.relative_to(ROOT).as_posix(): len(path.read_text(encoding='utf-8').split())
-        for path in (ROOT / 'docs').rglob('*.md')
-    }
-    assert {page for page, count in words.items() if count > 4000} == set()
-
-
 @pytest.mark.parametrize('name', ['README.md', 'CONTRIBUTING.md', 'CHANGELOG.rst'])
 def test_links_of_pages_from_the_root_lead_to_pages(made: Any, name: str) -> None:
     text = made.at_the_root(name)

@@ -6,6 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
+from attrs import evolve
 import numpy as np
 
 from sonar_imm.estimates import Estimate
@@ -15,26 +16,17 @@ from sonar_imm.soundings import COLUMNS, soundings_of
 def estimate(**changed):
     T = 6
     extras = {
-        'range': np.linspace(20.0, 30.0, T),
-        'valid': np.array([1, 1, 0, 1, 1, 1], np.uint8),
-        'label': np.array([0, 1, 1, 0, 0, 1], np.uint8),
-        'label_probability': np.full(T, 0.9),
-        'vertical_uncertainty': np.full(T, 0.02),
-        'horizontal_uncertainty': np.full(T, 0.1),
-        'intensity': np.full(T, -3.0),
-        'beam_angle': np.linspace(0.5, 1.2, T),
-        'side': np.ones(T, np.uint8),
-        **changed,
-    }
+        'range': np.linspace(20.0, 30.0, T), 'valid': np.array([1, 1, 0, 1, 1, 1], np.uint8),
+        'label': np.array([0, 1, 1, 0, 0, 1], np.uint8), 'label_probability': np.full(T, 0.9),
+        'vertical_uncertainty': np.full(T, 0.02), 'horizontal_uncertainty': np.full(T, 0.1),
+        'intensity': np.full(T, -3.0), 'beam_angle': np.linspace(0.5, 1.2, T),
+        'side': np.ones(T, np.uint8), **changed,
+    }  # fmt: skip
     return Estimate(
-        stamp_ns=7,
-        frame_id='map',
-        xyz=np.arange(3 * T, dtype=np.float32).reshape(T, 3),
-        state_names=('height',),
-        state=np.zeros((T, 1)),
-        covariance=np.ones((T, 1, 1)),
+        stamp_ns=7, frame_id='map', xyz=np.arange(3 * T, dtype=np.float32).reshape(T, 3),
+        state_names=('height',), state=np.zeros((T, 1)), covariance=np.ones((T, 1, 1)),
         extras=extras,
-    )
+    )  # fmt: skip
 
 
 def test_one_row_for_each_bin_with_an_echo_in_the_types_of_the_contract():
@@ -79,24 +71,4 @@ def test_without_layover_there_is_one_surface():
 def test_estimates_without_navigation_have_no_soundings():
     plain = estimate()
     extras = {k: v for k, v in plain.extras.items() if 'uncertainty' not in k}
-    assert (
-        soundings_of(
-            Estimate(
-                **{
-                    **{
-                        f: getattr(plain, f)
-                        for f in (
-                            'stamp_ns',
-                            'frame_id',
-                            'xyz',
-                            'state_names',
-                            'state',
-                            'covariance',
-                        )
-                    },
-                    'extras': extras,
-                }
-            )
-        )
-        is None
-    )
+    assert soundings_of(evolve(plain, extras=extras)) is None

@@ -11,8 +11,10 @@
 The metrics of a diver track and of a sea floor differ. So each system has a module that judges its
 runs, `System.judge`, which provides
 
-- ``judge(folder, options) -> Judgement``: reads the run and the truth, scores them and summarises;
-- ``LIMIT``: the `Limit` of the error for the shipped recordings.
+- ``scored(folder, run, options)``: reads the estimates and the truth and scores them;
+- ``METRICS``, ``SEEN`` and ``summary_sentence``: how people see the scores;
+- ``LIMIT`` and ``REMARK``: the `Limit` of the error for the shipped recordings, and what is said
+  beside the error.
 
 Everything else is the same for all of them: the folder of a run, the page, the commands.
 """
@@ -21,7 +23,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
+import functools
 from importlib import import_module
+import math
 from pathlib import Path
 from typing import Any, Protocol, TYPE_CHECKING
 
@@ -31,7 +35,7 @@ from sonar_imm.trackers import SYSTEMS
 
 from ..offline.run_folder import RunFolder
 from ..recordings.sources import BagError
-from .numbers import Card, cards, Check, fill, front, lines, Metric, Text, verdict
+from .numbers import Card, cards, Check, fill, front, lines, look_up, Metric, Text, verdict
 
 if TYPE_CHECKING:  # it loads plotly, which only a report needs and which takes a second
     from .report import Part, Section
@@ -42,12 +46,14 @@ TRUTH_GAP = 60.0
 @frozen
 class Limit:
     """What an error may be at most: `meaning` names the error, e.g. 'position RMSE', and `metric`
-    is its dotted name in ``metrics.json``."""
+    is its dotted name in ``metrics.json``. missed: what is said where there is truth and no error
+    could be measured; empty for nothing."""
 
     value: float
     unit: str
     meaning: str
     metric: str
+    missed: str = ''
 
     def check(self, error: float, *, at_most: float | None = None, remark: str = '') -> Check:
         """Compare `error` with the limit, or with `at_most` instead; `remark` follows it."""
@@ -131,20 +137,52 @@ class Judgement:
         )
 
 
+Scored = tuple[dict[str, Any], 'Callable[[], Iterable[Section]]']
+"""Metrics of a run, and what makes the sections of its report."""
+
+
 class Judge(Protocol):
-    """What the module `System.judge` provides."""
+    """What the module `System.judge` provides; REMARK follows the error where it is checked, SEEN
+    says what was tracked."""
 
     LIMIT: Limit
+    METRICS: Sequence[Metric]
+    REMARK: Text
+    SEEN: Text
 
-    def judge(self, folder: RunFolder, options: JudgeOptions) -> Judgement:
-        """Judge the run in `folder`. Raises `BagError` when it or the truth cannot be read."""
+    def summary_sentence(self, metrics: Mapping[str, Any]) -> str:
+        """Tell the result in a few sentences."""
+        ...
+
+    def scored(self, folder: RunFolder, run: Mapping[str, Any], options: JudgeOptions) -> Scored:
+        """Score the run in `folder`. Raises `BagError` when it or the truth cannot be read."""
         ...
 
 
 def judge(folder: RunFolder, options: JudgeOptions | None = None) -> Judgement:
     """Judge a run of any system. Raises `BagError` when it or the truth cannot be read."""
-    system: Judge = import_module(SYSTEMS[folder.read_run()['system']].judge)
-    return system.judge(folder, options or JudgeOptions())
+    run = folder.read_run()
+    system: Judge = import_module(SYSTEMS[run['system']].judge)
+    metrics, sections = system.scored(folder, run, options or JudgeOptions())
+    return Judgement(
+        run=run,
+        metrics=metrics,
+        words=system.summary_sentence,
+        shown=system.METRICS,
+        seen=system.SEEN,
+        sections=sections,
+        accuracy=functools.partial(_accuracy, system, metrics),
+    )
+
+
+def _accuracy(system: Judge, metrics: dict[str, Any], at_most: float | None) -> Check | None:
+    limit = system.LIMIT
+    error = look_up(metrics, limit.metric)
+    if error is None or math.isnan(error):
+        if error is None or not limit.missed:
+            return None
+        return Check(f'{limit.meaning} against truth', limit.missed, 'at least one', good=False)
+    return limit.check(error, at_most=at_most, remark=fill(system.REMARK, metrics))
 
 
 @contextlib.contextmanager

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
 from functools import partial
 import gzip
 from pathlib import Path
@@ -40,25 +41,30 @@ from sonar_imm.texts import visible
 from ..recordings.sources import BagError
 from .numbers import Card, Check, counted, flatten, front
 from .plotting import plain_content
+from .thumbnails import thumbnail
 
 LEAST_GL_POINTS = 2000
 MOST_GL_FIGURES = 4
 """A browser keeps 16 WebGL contexts and blanks the oldest beyond. A figure takes up to three, so
 only the largest figures of a page are drawn by WebGL."""
 PLOTLYJS = 'plotly.packed.js'
+EARLIEST_DATE_NS, LATEST_DATE_NS = 315_532_800 * 10**9, 4_102_444_800 * 10**9
+"""Stamps from 1980 to 2100 are shown as dates; others count from a start of their own."""
 LONGEST_HEAD = 65536
 """Bytes in which a page says who made it."""
 
 
 @frozen
 class Section:
-    """A section of the page: heading, one paragraph, then a figure or a table."""
+    """A section of the page: heading, one paragraph, then a figure or a table. picture: whether
+    its figure stands for the run on the front page of several."""
 
     title: str
     text: str
     figure: go.Figure | None = None
     header: Sequence[str] = ()
     rows: Sequence[Sequence[object]] = ()
+    picture: bool = False
 
 
 @frozen(kw_only=True)
@@ -100,6 +106,20 @@ class Part:
             return f'FAILED: {", ".join(self.failed)}'
         checked = [f'{counted(len(self.checks), "check")} ok'] if self.checks else []
         return ', '.join([*checked, self.verdict or 'uncertainty not scored'])
+
+    @property
+    def start(self) -> str:
+        """The date and time of the first estimate; empty where it has none, or before 1980."""
+        stamp = self.run.get('first_stamp_ns', 0)
+        if not EARLIEST_DATE_NS < stamp < LATEST_DATE_NS:
+            return ''
+        instant = datetime.fromtimestamp(stamp // 10**9, timezone.utc)
+        return f'{instant:%Y-%m-%d %H:%M:%S} UTC'
+
+    @property
+    def picture(self) -> go.Figure | None:
+        """The figure that stands for the run, None without one."""
+        return next((section.figure for section in self.sections if section.picture), None)
 
     @property
     def was_played(self) -> bool:
@@ -169,7 +189,22 @@ def report_html(part: Part, front_page: str = '') -> str:
 def front_html(parts: Sequence[Part], links: Sequence[str]) -> str:
     """The front page of several runs, a row for each, with the address of its page."""
     rows = [(part, quote(link), front(part.cards)) for part, link in zip(parts, links)]
-    return _rendered('front.html', rows=rows)
+    return _rendered('front.html', rows=rows, pictures=_pictures(parts, links))
+
+
+def _pictures(parts: Sequence[Part], links: Sequence[str]) -> list[tuple[Part, str, str]]:
+    """Return one run of each system, the one with most checks: with its link and picture."""
+    best: dict[str, tuple[Part, str]] = {}
+    for part, link in zip(parts, links):
+        system = part.run['system']
+        held = best.get(system)
+        if part.picture is not None and (held is None or len(part.checks) > len(held[0].checks)):
+            best[system] = part, link
+    return [
+        (part, quote(link), thumbnail(part.picture))
+        for part, link in best.values()
+        if part.picture is not None
+    ]
 
 
 def _rendered(template: str, **values: Any) -> str:

@@ -297,7 +297,8 @@ class RunFolder:
         notes: Mapping[str, str] | None = None,
     ) -> dict[str, int]:
         """Write bag and tables while the estimates come; gives the number of estimates and rows,
-        and of soundings where there are any. notes: what the metadata of Parquet files say."""
+        the stamp of the first estimate, and the number of soundings where there are any. notes:
+        what the metadata of Parquet files say."""
         written = {'estimates': 0, 'rows': 0}
         with contextlib.ExitStack() as stack:
 
@@ -316,6 +317,7 @@ class RunFolder:
                 )
                 for each in bins:
                     each.write(estimate.stamp_ns, estimate.columns())
+                written.setdefault('first_stamp_ns', estimate.stamp_ns)
                 written['estimates'] += 1
                 written['rows'] += len(estimate)
                 if (soundings := soundings_of(estimate)) is None:

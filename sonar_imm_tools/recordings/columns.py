@@ -25,7 +25,8 @@ USUAL_NAMES = {
         'time timestamp t datetime date_time utc utc_time time_utc timestamp_utc datetime_utc '
         'date_time_utc epoch unix_time date_and_time device_time detection_timestamp '
         'detection_timestamp_utc datecollectedutc date_collected_utc basedatetime '
-        'base_date_time gps_time datenum matlab_time excel_time zeit zeitstempel zeitpunkt '
+        'base_date_time gps_time datenum matlab_time excel_time mjd jd julian_date elapsed '
+        'elapsed_time zeit zeitstempel zeitpunkt '
         'uhrzeit datum_zeit datum_uhrzeit horodatage date_heure heure temps fecha_hora '
         'fecha_y_hora hora tiempo data_hora data_e_hora tidspunkt tidsstempel klokkeslett tid'
     ),
@@ -58,6 +59,10 @@ USUAL_NAMES = {
         'n_s ns n_or_s north_south lat_dir latitude_dir latitude_direction lat_hemisphere '
         'latitude_hemisphere hemisphere_lat lat_ref latitude_ref lat_ns latitude_ns'
     ),
+    'latitude_minutes': '',
+    'longitude_minutes': '',
+    'latitude_seconds': '',
+    'longitude_seconds': '',
     'longitude_hemisphere': (
         'e_w ew e_or_w o_w e_o east_west lon_dir long_dir longitude_dir longitude_direction '
         'lon_hemisphere longitude_hemisphere hemisphere_lon lon_ref longitude_ref lon_ew '
@@ -77,7 +82,11 @@ USUAL_NAMES = {
         'sigma accuracy std_xy sigma_xy position_std standardabweichung genauigkeit ecart_type '
         'precision desviacion_estandar desvio_padrao precisao noyaktighet standardavvik'
     ),
-    'range': 'distance dist entfernung distanz abstand distancia avstand',
+    'range': (
+        'distance dist entfernung distanz abstand distancia avstand slant_range slant_distance '
+        'schraegentfernung schraegdistanz distance_oblique distancia_inclinada skraavstand '
+        'horizontal_range horizontal_distance ground_range'
+    ),
     'std_range': 'sigma_range range_std',
     'forward': 'ahead fwd rel_forward',
     'starboard': 'stbd rel_starboard',
@@ -87,6 +96,10 @@ USUAL_NAMES = {
     'vessel_longitude': '',
     'vessel_latitude_hemisphere': '',
     'vessel_longitude_hemisphere': '',
+    'vessel_latitude_minutes': '',
+    'vessel_longitude_minutes': '',
+    'vessel_latitude_seconds': '',
+    'vessel_longitude_seconds': '',
     'heading': 'hdg gyro true_heading heading_true steuerkurs cap cap_vrai',
     'roll': 'roll_angle rollen roulis balanceo',
     'pitch': 'pitch_angle stampfen tangage cabeceo',
@@ -95,7 +108,8 @@ USUAL_NAMES = {
     'id': (
         'track_id target target_id target_name target_no target_number tag beacon beacon_id '
         'beacon_name transponder diver mmsi name taucher tauchername ziel zielnummer ziel_nr '
-        'zielname cible nom balise objetivo nombre alvo nome navn maal dykker plongeur buzo'
+        'zielname cible nom balise objetivo nombre alvo nome navn maal dykker plongeur buzo '
+        'buceador mergulhador'
     ),
     'valid': 'position_valid is_valid fix_valid validity gueltig valide valido gyldig',
     'status': 'fix_status position_status zustand etat statut estado',
@@ -142,6 +156,12 @@ VESSELS = (
 """Words that make a position or a heading that of the vessel."""
 ZONES = ('utc', 'gmt', 'local', 'lokal')
 """Words beside the name of a time."""
+_OFFSET = re.compile(r'_\d\d?(_\d\d)?$')
+PARTS = {
+    'minutes': ('min', 'mins', 'minute', 'minutes', 'minuten', 'minutos', 'minutter'),
+    'seconds': ('sec', 'secs', 'second', 'seconds', 'sekunden', 'secondes', 'segundos'),
+}
+"""Last words of headers of the minutes and seconds of degrees in columns of their own."""
 TARGETS = ('target', 'beacon', 'diver', 'rov', 'ziel', 'taucher', 'cible', 'objetivo', 'alvo')
 """Words that make a position that of the target."""
 OF_TARGETS = ('x', 'y', 'z', 'depth', 'latitude', 'longitude')
@@ -157,17 +177,36 @@ FROM_NORTH = {'azimuth', 'azimut', 'relevement', 'demora', 'true', 'north'}
 FROM_BOW = {'gisement', 'marcacao', 'relative', 'rel', 'bow', 'seitenpeilung'}
 """Words of headers of bearings that usually count from north and from the bow."""
 
+SLANT = ('slant', 'schraeg', 'oblique', 'inclinada', 'skra')
+LEVEL = ('horizontal', 'ground', 'level')
+"""Begins of words of headers of ranges along the ray and in the plane."""
+
 METRES = {
     'm': 1.0, 'meter': 1.0, 'meters': 1.0, 'metre': 1.0, 'metres': 1.0, 'metros': 1.0,
     'km': 1e3, 'dm': 0.1, 'cm': 1e-2, 'mm': 1e-3,
     'ft': 0.3048, 'feet': 0.3048, 'foot': 0.3048, 'fuss': 0.3048,
     'nm': 1852.0, 'nmi': 1852.0, 'fathom': 1.8288, 'fathoms': 1.8288,
+    **dict.fromkeys(('pied', 'pieds', 'pie', 'pies', 'fot', 'ft_us'), 0.3048),
+    **dict.fromkeys(('yd', 'yds', 'yard', 'yards'), 0.9144),
+    **dict.fromkeys(('mi', 'mile', 'miles'), 1609.344),
+    **dict.fromkeys(('inch', 'inches', 'zoll'), 0.0254),
 }  # fmt: skip
 SECONDS = {'s': 1.0, 'sec': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 RADIANS = {
     'rad': 1.0, 'radians': 1.0, 'mrad': 1e-3, 'gon': math.pi / 200.0,
     **dict.fromkeys(('deg', 'degree', 'degrees', 'grad', 'graus', 'grados'), math.pi / 180.0),
 }  # fmt: skip
+TIME_WORDS = {
+    **dict.fromkeys(('s', 'sec', 'secs', 'second', 'seconds', 'sekunden', 'secondes'), 's'),
+    **dict.fromkeys(('ms', 'msec', 'millis', 'milliseconds'), 'ms'),
+    **dict.fromkeys(('us', 'usec', 'microseconds'), 'us'),
+    **dict.fromkeys(('ns', 'nsec', 'nanoseconds'), 'ns'),
+    **dict.fromkeys(('min', 'mins', 'minute', 'minutes', 'minuten', 'minutos', 'minutter'), 'min'),
+    **dict.fromkeys(('h', 'hr', 'hrs', 'hour', 'hours', 'stunden', 'heures', 'horas'), 'h'),
+    **dict.fromkeys(('d', 'day', 'days', 'tage', 'jours', 'dias', 'dager'), 'd'),
+}
+"""Units of times by their words in headers."""
+_TIME_UNIT = re.compile(f'_({"|".join(sorted(TIME_WORDS, key=len, reverse=True))})$')
 SPEEDS = {'m_s': 1.0, 'mps': 1.0, 'km_h': 1 / 3.6, 'kmh': 1 / 3.6}
 SPEEDS |= dict.fromkeys(('kn', 'kt', 'kts', 'knots'), 1852.0 / 3600.0)
 OTHER_UNITS = ('px', 'pixel', 'pixels', 'samples', 'bar', 'mbar', 'dbar', 'hpa', 'kpa', 'psi')
@@ -199,7 +238,10 @@ _BRACKETS = re.compile(r'[\[(]([^\])]*)')
 
 FRACTIONS = {'mil': 10**6, 'msec': 10**6, 'mi': 10**3, 'usec': 10**3, 'nan': 1, 'nsec': 1}
 """Nanoseconds of the unit of a column of parts of a second by the begin of its name, else s."""
-DAY_NAMES = {'datenum': 'datenum', 'matlab_time': 'datenum', 'excel_time': 'excel'}
+DAY_NAMES = {
+    'datenum': 'datenum', 'matlab_time': 'datenum', 'excel_time': 'excel', 'mjd': 'mjd',
+    'jd': 'julian', 'julian_date': 'julian',
+}  # fmt: skip
 LOTEK = {'date', 'time', 'toa', 'tag_id'}
 """Columns of an export of Lotek, which writes the month before the day."""
 THELMA = {'id', 'protocol', 'receiver'}
@@ -239,10 +281,24 @@ def plain(text: str) -> str:
 
 
 def name_of(header: str) -> str:
-    """Reduce a header to its name: ``East [m]``, ``east_m`` and ``EAST`` are all ``east``."""
+    """Reduce a header to its name: ``East [m]``, ``east_m`` and ``EAST`` are all ``east``.
+
+    An axis in brackets behind a letter is the name: ``X (North)`` is ``north``.
+    """
     name = plain(_BRACKETS.split(header)[0])
+    if name in ('x', 'y') and (inner := _BRACKETS.search(header)):
+        axis = plain(inner.group(1))
+        return axis if axis in (*ALIASES['x'], *ALIASES['y']) else name
+    if (timed := _TIME_UNIT.sub('', name)) in ALIASES['stamp']:
+        return timed
     found = None if name in _NAMES else _UNIT.search(name)
     return name[: found.start()] if found and found.end() == len(name) else name
+
+
+def time_unit_of(header: str) -> str:
+    """Return the unit of times in a header, as in ``Time (min)`` or ``t_ms``; empty without."""
+    found = _TIME_UNIT.search('_' + plain(header))
+    return TIME_WORDS[found.group(1)] if found else ''
 
 
 def unit_of(header: str) -> str:
@@ -260,7 +316,7 @@ def factor_of(name: str, header: str) -> float:
     """Return the factor from the unit of a header to that of a quantity, 1 where the header has no
     unit. Raises `BagError` for a unit of another kind."""
     unit = unit_of(header)
-    if not unit or name not in UNITS:
+    if not unit or name not in UNITS or unit == 's' and name.endswith('latitude'):
         return 1.0
     if unit not in UNITS[name]:
         raise BagError(
@@ -280,9 +336,17 @@ def rank_of(quantity: str, header: str) -> int:
     one. Names with a word for the target come first."""
     name = name_of(header)
     aliases = ALIASES[quantity]
+    whole, _, part = quantity.rpartition('_')
+    if part in PARTS:
+        words = plain(header.replace('°', ' deg ')).split('_')
+        of_part = len(words) > 1 and words[-1] in PARTS[part]
+        return rank_of(whole, '_'.join(words[:-1])) if of_part else len(_NAMES)
     if name in aliases:
         return aliases.index(name)
-    if quantity in ('stamp', 'date') and (inner := _without(ZONES, name)) in aliases:
+    if (
+        quantity in ('stamp', 'date')
+        and (inner := _without(ZONES, _OFFSET.sub('', name))) in aliases
+    ):
         return len(aliases)
     if quantity in OF_TARGETS and (inner := _without(TARGETS, name)) and inner in aliases:
         return -1
@@ -298,6 +362,25 @@ def _without(words: tuple[str, ...], name: str) -> str:
         if name.startswith(f'{word}_') or name.endswith(f'_{word}'):
             return name.removeprefix(f'{word}_').removesuffix(f'_{word}')
     return ''
+
+
+def sign_in(name: str, header: str) -> float | None:
+    """Return the sign that the header of a latitude or longitude states for all its values, as in
+    ``Longitude (°W)``; None for headers with no or several such words, or with words for signs."""
+    words = {word for word in plain(header).split('_') if word != 'o'}
+    signs = {sign_of(name, word) for word in words} - {None}
+    told = any(word.startswith(('neg', 'pos', 'minus', 'plus')) for word in words)
+    return signs.pop() if len(signs) == 1 and not told and not set('+-') & set(header) else None
+
+
+def zone_in(header: str) -> str:
+    """Return the zone that a header states, as in ``time_utc`` or ``Time (GMT+02:00)``; empty
+    without one. Raises `BagError` for an offset that is none."""
+    found = re.search(r'(?:utc|gmt)(?:[\s_]*([+-])\s*(\d\d?)(?::?(\d\d))?(?!\d))?', header.lower())
+    if found is None:
+        return ''
+    sign, hours, minutes = found.groups()
+    return f'{sign}{int(hours):02d}:{minutes or "00"}' if sign else 'UTC'
 
 
 def sign_of(name: str, word: str) -> float | None:

@@ -29,10 +29,10 @@ from sonar_imm.intake.leaps import FASTEST, NEAR
 from sonar_imm.measurements import Rejection, VesselFix
 
 from .. import SECOND
-from .csv_table import Row, Table
 from .messages import cdr_of, ros_message
 from .reader import BagMessage, BagReader
 from .sources import BagError, TARGET_NAMES
+from .tables import Row, Table
 from .times import BadRow
 from .writer import BagWriter
 

@@ -17,9 +17,9 @@ from typing import Any, ClassVar
 
 from attrs import frozen, NOTHING
 
-from .csv_table import CsvOptions
 from .options import group, option
-from .places import BEARINGS
+from .places import BEARINGS, RANGES
+from .tables import CsvOptions
 
 
 def _origin(text: str) -> tuple[float, ...]:
@@ -115,6 +115,9 @@ class _Polar(_WithTruth):
     bearing_std_deg: float | None = option(None, 'DEGREES',
         'Standard deviation of bearings, for rows that state none.', flag='bearing-std',
         kind='float', above=0.0)
+    ranges: str = option('', '',
+        'Whether ranges are along the ray (slant) or in the plane (horizontal). By default as '
+        'their header says, else horizontal where the depth hardly matters.', choices=RANGES)
 
 
 @frozen(kw_only=True)
@@ -130,7 +133,7 @@ class FixesOptions(_Polar):
 
     Columns: stamp, or date and time of day, x and y [m] or latitude and longitude [deg]; optional
     var_x, cov_xy, var_y [m^2] or std_x, std_y or std [m], id and valid. In place of x and y: range
-    [m, horizontal] and bearing from a sensor at the origin, with std_range and std_bearing;
+    [m] and bearing from a sensor at the origin, with std_range and std_bearing;
     degrees unless the header says rad. Usual names are recognised; which columns were taken, and
     which not, is said. Times may count from 0; one that is written without a zone needs
     --time-zone. A row with a time and no position is a scan in which nobody was seen. Rows flagged
@@ -151,8 +154,8 @@ class FixesOptions(_Polar):
 class RelativeOptions(_Polar):
     """CSV of positions seen from a vessel to /relative and /nav.
 
-    Columns: stamp; forward and starboard [m], or range [m, horizontal] and bearing, with std_range
-    and std_bearing, degrees unless the header says rad; vessel_x and vessel_y [m], or
+    Columns: stamp; forward and starboard [m], or range [m] and bearing, with std_range and
+    std_bearing, degrees unless the header says rad; vessel_x and vessel_y [m], or
     vessel_latitude and vessel_longitude [deg]; heading [deg, clockwise from north], which only
     bearings from north or east can do without; optional depth of the target below the vessel, std
     [m], id and valid. A row with the pose and no position is a scan in which nobody was seen.

@@ -6,495 +6,27 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""CSV files of any origin: any delimiter, any names of columns, any unit of time.
-
-Columns are found by their usual names (`columns`); columns with other names are mapped by hand.
-A row that cannot be read raises `BadRow`.
-"""
+"""CSV files with any delimiter."""
 
 from __future__ import annotations
 
 import codecs
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 import contextlib
 import csv
-from decimal import Decimal
-import functools
-import itertools
-import math
 from pathlib import Path
 import re
 from typing import Any, TextIO
 
-from attrs import frozen
-
-from sonar_imm.parameters import did_you_mean
-
-from .columns import (
-    ALIASES,
-    DAY_NAMES,
-    factor_of,
-    FRACTIONS,
-    LOTEK,
-    name_of,
-    NO,
-    NOTHING,
-    plain,
-    quantities_of,
-    rank_of,
-    YES,
-)
-from .options import nanoseconds, option
+from .columns import time_unit_of, unit_of
 from .sources import BagError, start_of
-from .times import (
-    BadRow,
-    dated,
-    DAYS,
-    form_of,
-    HHMMSS,
-    hhmmss,
-    moment_ns,
-    ORDERS,
-    orders_of,
-    split_time,
-    text_of_days,
-    TIME_OF_DAY,
-    TIME_TEXT,
-    zone_of,
-)
+from .tables import CsvOptions, Table
 
-TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
-
-LONGEST_NS = 10**8 * 10**9
-"""A recording is shorter, a date since 1970 longer."""
 LONGEST_LINE = 1 << 20
 """Characters."""
-ASKED = (
-    'x', 'y', 'z', 'depth', 'latitude', 'longitude', 'range', 'bearing', 'heading',
-    'vessel_x', 'vessel_y', 'vessel_latitude', 'vessel_longitude',
-)  # fmt: skip
-"""Quantities of which two columns with other values are a question."""
-LOOKED_AT = 1000
-"""Rows by which a file is judged."""
-
 RECORDS = 'VEMCO DATA LOG'
 """Begin of a file of records of several kinds, each with its own header, of which detections
 (``DET``) are read."""
-_THOUSANDS = re.compile(r'[-+]?\d{1,3}(,\d{3})+$')
-_DECIMAL_COMMA = re.compile(r'[-+]?\d*,(\d{1,2}|\d{4,})$')
-NUMBER = re.compile(r'[-+]?(\d+([.,]\d*)?|[.,]\d+)$')
-_ZERO = re.compile(r'[-+]?0*([.,]0*)?$')
-
-
-@frozen(kw_only=True)
-class CsvOptions:
-    """How to read a CSV file.
-
-    columns: what is not listed is found by its usual names (`ALIASES`); case and units are
-    ignored. time_zone, empty: UTC where the header says so (``utc_time``), else times without a
-    zone are refused. time_unit, empty: from the header (``time_ms``), else s; ISO 8601 texts are
-    recognised, also as a date and a time of day in two columns.
-    """
-
-    # fmt: off
-    columns: Mapping[str, str] = option({}, 'NAME=HEADER',
-        'Header of a column of {what}, e.g. x=easting.', flag='column', kind='pairs')
-    time_zone: str = option('', 'ZONE',
-        'Zone of times in {what} that do not say it: UTC, +02:00 or Europe/Berlin.')
-    time_unit: str = option('', 'UNIT',
-        'Unit of numeric times in {what}: s, ms, us or ns; HHMMSS for a time of day in one '
-        'number; datenum for days of MATLAB, excel for days of a spreadsheet.',
-        choices=('', *TIME_UNITS, HHMMSS, *DAYS))
-    date_order: str = option('', 'ORDER',
-        'Order of day, month and year in dates such as 05/06/24 in {what}.',
-        choices=('', *ORDERS))
-    time_offset_ns: int = option(0, 'SECONDS',
-        'Added to every time of {what}.', flag='time-offset', parse=nanoseconds)
-    delimiter: str = option('', '',
-        'Delimiter between the columns of {what}; found automatically by default.')
-    ignore: Sequence[str] = option((), 'NAME',
-        'Quantity of {what} to leave out though a column has its name, e.g. id.', many=True)
-    # fmt: on
-
-    def __attrs_post_init__(self) -> None:
-        units = (*TIME_UNITS, HHMMSS, *DAYS)
-        if self.time_unit not in ('', *units):
-            raise BagError(
-                f"the time unit must be one of {', '.join(units)}, got '{self.time_unit}'"
-            )
-        if self.time_zone:
-            zone_of(self.time_zone)
-        for name in (*self.columns, *self.ignore):
-            if name not in ALIASES:
-                raise BagError(
-                    f"there is no quantity '{name}' to map a column to"
-                    f'{did_you_mean(name, ALIASES)}'
-                )
-
-
-@frozen
-class Row:
-    """One line of data; the methods raise `BadRow`."""
-
-    table: Table
-    line: int
-    cells: list[str]
-
-    def text(self, name: str) -> str:
-        """The cell as text; empty when the column is missing or the line is short."""
-        self.table.used.add(name)
-        index = self.table.index.get(name, len(self.cells))
-        return self.cells[index].strip() if index < len(self.cells) else ''
-
-    def number(self, name: str) -> float:
-        """A number that has to be there and finite. Raises `BadRow`."""
-        value = self.optional(name)
-        if math.isnan(value):
-            raise BadRow(f'{self.table.header(name)} is empty')
-        return value
-
-    def empty(self, *names: str) -> bool:
-        """Whether all of these cells are empty, or not a number, as some write that."""
-        return all(self.text(name).lower() in NOTHING for name in names)
-
-    def optional(self, name: str) -> float:
-        """A number in the unit of its quantity (`columns.UNITS`); NaN when the cell is empty,
-        missing or NaN."""
-        text = self.text(name)
-        if text.lower() in NOTHING:
-            return math.nan
-        number = self._with_point(name)
-        try:
-            value = float(number)
-        except ValueError:
-            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a number") from None
-        if math.isinf(value):
-            raise BadRow(f'{self.table.header(name)} is infinite')
-        return value * self.table.factor(name)
-
-    def _with_point(self, name: str) -> str:
-        """The text of a number with a decimal point. Raises `BadRow`."""
-        text = self.text(name)
-        comma, point = text.rfind(','), text.rfind('.')
-        if comma < 0:
-            return text
-        if point >= 0:
-            mark = ',' if comma > point else '.'
-            return text.replace('.' if mark == ',' else ',', '').replace(mark, '.')
-        if _THOUSANDS.match(text) and not self.table.decimal_comma:
-            raise BadRow(
-                f"{self.table.header(name)} is '{text[:40]}': the comma may be that of thousands "
-                'or a decimal one; write a decimal point'
-            )
-        return text.replace(',', '.')
-
-    def height(self) -> float:
-        """z, or minus the depth, in metres; 0 without either."""
-        z = self.optional('z') if self.table.has('z') else -self.optional('depth')
-        return 0.0 if math.isnan(z) else z
-
-    def require_valid(self) -> None:
-        """Raise `BadRow` for a row that the column ``valid``, or ``status`` where it holds words
-        such as OK and error, marks as invalid."""
-        name = 'valid' if self.table.has('valid') or not self.table.has_status else 'status'
-        flag = self.text(name).lower()
-        if not flag or {flag, plain(flag)} & set(YES):
-            return
-        if {flag, plain(flag)} & set(NO):
-            raise BadRow('the row is flagged as invalid', 'flagged invalid')
-        raise BadRow(f"{self.table.header(name)} is '{flag[:40]}', neither true nor false")
-
-    def seconds_ns(self, name: str) -> int:
-        """A duration or a time as integer nanoseconds, exactly as written."""
-        text = self.text(name)
-        try:
-            value = Decimal(self._with_point(name))
-            nanoseconds = value * self.table.time_scale(name)
-            if not abs(nanoseconds) < 2**63:
-                raise BadRow(
-                    f"{self.table.header(name)} is '{text[:40]}', beyond the year 2262; "
-                    'is the time unit right?'
-                )
-            return round(nanoseconds)
-        except ArithmeticError:
-            raise BadRow(
-                f"{self.table.header(name)} is '{text[:40]}', not a time: a number or "
-                '2024-05-31T10:00:00Z'
-            ) from None
-
-    def stamp_ns(self, name: str = 'stamp') -> int:
-        """A time since 1970 in integer nanoseconds, with the offset of the options added."""
-        stamp = moment_ns(self._moment(name), lambda: self._zone(name))
-        if stamp is None:
-            stamp = self.seconds_ns(name)
-        if name == 'stamp':
-            stamp = self._with_fraction(stamp)
-        stamp += self.table.options.time_offset_ns
-        if not stamp and self.table.counts_from_zero(name):
-            stamp = 1  # a stamp of 0 means none in ROS
-        if not 0 < stamp < 2**31 * 10**9:
-            raise BadRow(
-                f'{self.table.header(name)} is {stamp} ns since 1970, which no ROS stamp '
-                'can hold; set the time offset or the time unit'
-            )
-        return stamp
-
-    def _with_fraction(self, stamp_ns: int) -> int:
-        """A time with the part of a second that stands in a column of its own."""
-        unit = self.table.fraction_unit
-        if not unit:
-            return stamp_ns
-        own = round(self.number('fraction') * unit)
-        if stamp_ns % 10**9 == 0:
-            return stamp_ns + own
-        if abs(stamp_ns % 10**9 - own) > unit:
-            raise BadRow(
-                f'{self.table.header("stamp")} has another part of a second than '
-                f'{self.table.header("fraction")}'
-            )
-        return stamp_ns
-
-    def _moment(self, name: str) -> str:
-        """The text of a time, with the date of its own column where it has only a time of day."""
-        text, form = self.text(name), self.table.time_form(name)
-        if TIME_TEXT.match(text):
-            return text
-        if parts := None if self.table.time_unit(name) else split_time(text):
-            return dated(*parts, self.table.header(name), self.table.date_order(name))
-        if form in DAYS:
-            try:
-                return text_of_days(Decimal(self._with_point(name)), form)
-            except (ArithmeticError, ValueError):
-                return text
-        clock = hhmmss(text) if form == HHMMSS else text
-        if form == HHMMSS and not clock:
-            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a time as HHMMSS")
-        if not TIME_OF_DAY.match(clock):
-            return text
-        if not self.table.has('date'):
-            raise BadRow(
-                f"{self.table.header(name)} is '{text[:40]}', a time of day"
-                f'{" as HHMMSS" if form == HHMMSS else ""}, and no column holds the date: add '
-                'one, named date',
-                'no date',
-            )
-        order = self.table.date_order('date')
-        return dated(self.text('date'), clock, self.table.header('date'), order)
-
-    def _zone(self, name: str) -> str:
-        """The zone of a time that does not say it."""
-        if self.table.options.time_zone:
-            return self.table.options.time_zone
-        headers = f'{self.table.header(name)} {self.table.header("date")}'.lower()
-        if 'utc' in headers or 'gmt' in headers:
-            return 'UTC'
-        raise BadRow(
-            f"{self.table.header(name)} is '{self.text(name)[:40]}' without a time zone; say "
-            '--time-zone UTC, or that of the clock, e.g. --time-zone +02:00',
-            'no time zone',
-        )
-
-
-class Table:
-    """Named columns and an iterator over the rows of a file of any kind."""
-
-    delimiter = ','
-
-    def __init__(self, path: str | Path, options: CsvOptions | None, headers: Sequence[str]):
-        self.path = Path(path)
-        self.options = options or CsvOptions()
-        self.headers = list(headers)
-        self.index = self._find_columns()
-        self.used: set[str] = set()
-        self.problems: list[str] = []
-        self.cut_line = 0
-        self._from_zero: dict[str, bool] = {}
-        self._factors: dict[str, float] = {}
-        self.forms: dict[str, str] = {}
-        self.orders: dict[str, str] = {}
-
-    def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """The number of its line, or of its record, and the cells of each row."""
-        raise NotImplementedError
-
-    def __iter__(self) -> Iterator[Row]:
-        for line, cells in self.rows():
-            yield Row(self, line, cells)
-
-    def has(self, *names: str) -> bool:
-        """Say whether every one of these quantities has a column."""
-        return all(name in self.index for name in names)
-
-    def require(self, *names: str) -> None:
-        """Raise `BagError` naming the quantities without a column and what the file has."""
-        if missing := [name for name in names if name not in self.index]:
-            raise BagError(
-                f'{self.path} has no column for {" and ".join(missing)}; it has '
-                f'{", ".join(self.headers[:12])}; say which column holds '
-                f'{"it" if len(missing) == 1 else "them"}, as in --column {missing[0]}=HEADER'
-            )
-
-    @functools.cached_property
-    def first_rows(self) -> list[Row]:
-        """The rows by which the file is judged."""
-        return list(itertools.islice(self, LOOKED_AT))
-
-    def first_cells(self, column: int) -> list[str]:
-        """The cells of a column that are not empty, of the rows by which the file is judged."""
-        cells = (row.cells[column].strip() for row in self.first_rows if column < len(row.cells))
-        return [cell for cell in cells if cell.lower() not in NOTHING]
-
-    def is_blank(self, *names: str) -> bool:
-        """Say whether these quantities are empty or zero in every row that is looked at."""
-        cells = (cell for name in names for cell in self.first_cells(self.index[name]))
-        return all(_ZERO.match(cell) for cell in cells)
-
-    def varies(self, column: int) -> bool:
-        """Say whether a column holds numbers that change, and does not count the rows."""
-        values = self.first_numbers(column, 1.0)
-        steps = {after - before for before, after in itertools.pairwise(values)}
-        return bool(steps - {0.0, 1.0})
-
-    @functools.cached_property
-    def decimal_comma(self) -> bool:
-        """Whether commas within cells are decimal ones."""
-        cells = (cell for row in self.first_rows for cell in row.cells)
-        return self.delimiter != ',' or any(_DECIMAL_COMMA.match(cell.strip()) for cell in cells)
-
-    @functools.cached_property
-    def has_status(self) -> bool:
-        """Whether the column ``status`` holds words for good or bad."""
-        words = {
-            plain(cell) for cell in self.first_cells(self.index.get('status', len(self.headers)))
-        }
-        return any(word in (*YES, *NO) and len(word) > 1 and word.isalpha() for word in words)
-
-    def factor(self, name: str) -> float:
-        """Factor from the unit of a column to that of its quantity. Raises `BagError`."""
-        if name not in self._factors:
-            self._factors[name] = factor_of(name, self.header(name))
-            self._ask_for_one(name)
-        return self._factors[name]
-
-    def _ask_for_one(self, name: str) -> None:
-        """Raise `BagError` where several columns may be this quantity and hold other values."""
-        own = self.index.get(name, -1)
-        if name in self.options.columns or name not in ASKED or own < 0:
-            return
-        if rank_of(name, self.headers[own]) < 0:  # that of a target is the one
-            return
-        limit = 1e-6 if name.endswith('itude') else 0.02
-        for other, header in enumerate(self.headers):
-            if other in self.index.values() or name not in quantities_of(header):
-                continue
-            pairs = zip(
-                self.first_numbers(own, self._factors[name]),
-                self.first_numbers(other, factor_of(name, header)),
-            )
-            if any(abs(a - b) > limit for a, b in pairs):
-                raise BagError(
-                    f'{self.path}: {self.headers[own]} and {header} may both be {name}, and '
-                    f"differ; say --column '{name}={self.headers[own]}' or --column "
-                    f"'{name}={header}'"
-                )
-
-    def first_numbers(self, column: int, factor: float) -> list[float]:
-        """The numbers of a column of the rows by which the file is judged; none where a cell is
-        no number."""
-        cells = self.first_cells(column)
-        whole = all(NUMBER.match(cell) for cell in cells)
-        return [factor * float(cell.replace(',', '.')) for cell in cells] if whole else []
-
-    def counts_from_zero(self, name: str) -> bool:
-        """Whether the first times of the file are seconds from its own start rather than a date,
-        so that a time of 0 is one, and not one that is missing."""
-        if name not in self._from_zero:
-            times = []
-            for row in self.first_rows:
-                with contextlib.suppress(BadRow):
-                    times.append(row.seconds_ns(name))
-            self._from_zero[name] = max(times, default=0) < LONGEST_NS
-        return self._from_zero[name]
-
-    def columns_used(self) -> tuple[str, str]:
-        """What was taken from which column so far, and which columns were not, as text."""
-        taken = {name: self.index[name] for name in self.index if name in self.used}
-        columns = ', '.join(
-            name if self.headers[k] == name else f'{name} = {self.headers[k]}'
-            for name, k in taken.items()
-        )
-        left = [header for k, header in enumerate(self.headers) if k not in taken.values()]
-        return columns, ', '.join(header or '(no name)' for header in left)
-
-    def header(self, name: str) -> str:
-        """What the file calls a quantity."""
-        return self.headers[self.index[name]] if name in self.index else name
-
-    def time_scale(self, name: str) -> int:
-        """Nanoseconds in one unit of a time column."""
-        return TIME_UNITS.get(self.time_unit(name), TIME_UNITS['s'])
-
-    def time_unit(self, name: str) -> str:
-        """The unit of a time column that the options or its header state, else empty."""
-        suffix = re.search(r'[_ \[(](ms|us|ns|s)[\])]?$', self.header(name).lower())
-        return self.options.time_unit or (suffix.group(1) if suffix else '')
-
-    def time_form(self, name: str) -> str:
-        """How numbers of a time column are meant where they are no count of seconds: `HHMMSS` or a
-        name of `DAYS`. Raises `BagError` where that is not clear."""
-        if name not in self.forms:
-            unit = self.time_unit(name) or DAY_NAMES.get(name_of(self.header(name)), '')
-            form = unit if unit in (HHMMSS, *DAYS) else ''
-            if not unit and name in self.index:
-                cells = self.first_cells(self.index[name])
-                form = form_of(self.header(name), cells, self.has('date'))
-            self.forms[name] = form
-        return self.forms[name]
-
-    def date_order(self, name: str) -> str:
-        """The order of day, month and year in dates that are only numbers; empty where the rows
-        leave several."""
-        if self.options.date_order or name not in self.index:
-            return self.options.date_order
-        if name not in self.orders:
-            cells = self.first_cells(self.index[name])
-            orders = orders_of([(split_time(cell) or (cell,))[0] for cell in cells])
-            if LOTEK <= {name_of(header) for header in self.headers}:
-                orders = ['MDY']
-            self.orders[name] = orders[0] if len(orders) == 1 else ''
-        return self.orders[name]
-
-    @functools.cached_property
-    def fraction_unit(self) -> int:
-        """Nanoseconds in one unit of the column of the parts of seconds; 0 without such a column,
-        or where its values are no parts of a second."""
-        if not self.has('fraction'):
-            return 0
-        header = name_of(self.header('fraction'))
-        unit = next((ns for begin, ns in FRACTIONS.items() if header.startswith(begin)), 10**9)
-        values = self.first_numbers(self.index['fraction'], unit)
-        return unit if values and all(0.0 <= value < 1e9 for value in values) else 0
-
-    def _find_columns(self) -> dict[str, int]:
-        """Match headers with quantities: mapped by hand first, then by their usual names."""
-        by_hand = {}
-        for name, header in self.options.columns.items():
-            if header not in self.headers:
-                raise BagError(
-                    f"{self.path} has no column '{header}'{did_you_mean(header, self.headers)}"
-                )
-            by_hand[name] = self.headers.index(header)
-        found = dict(by_hand)
-        usual = [quantities_of(header) for header in self.headers]
-        for name in ALIASES:
-            free = [
-                index
-                for index, names in enumerate(usual)
-                if name in names and index not in by_hand.values()
-            ]
-            if name not in found and free and name not in self.options.ignore:
-                found[name] = min(free, key=lambda index: rank_of(name, self.headers[index]))
-        return found
 
 
 class CsvTable(Table):
@@ -511,11 +43,12 @@ class CsvTable(Table):
             raise BagError(f'{self.path} is no text, not a CSV file')
         self._encoding = _encoding(start)
         with self._open() as file:
-            lines = (line for line in _lines(file) if line.strip() and not line.startswith('#'))
+            lines = (line for line in _lines(file) if line.strip() and not _is_aside(line))
             first = next(lines, '')
             if first.startswith(RECORDS):
                 first = next((line for line in lines if line.startswith('DET_DESC')), first)
                 self._kind = 'DET'
+            second = next(lines, '')
         if not first:
             raise BagError(f'{self.path} is empty, not a CSV file')
         likely = max(',;\t|', key=first.count)
@@ -525,6 +58,9 @@ class CsvTable(Table):
         except csv.Error:
             raise self._no_table(1) from None
         super().__init__(path, options, headers)
+        if not self._kind:
+            with contextlib.suppress(csv.Error):
+                self.units = _units_of(next(csv.reader([second], **self._dialect), []), headers)
 
     def _no_table(self, line: int) -> BagError:
         return BagError(
@@ -533,7 +69,7 @@ class CsvTable(Table):
         )
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
-        ended, width, header_seen = True, 0, False
+        ended, width, header_seen, to_skip = True, 0, False, bool(self.units)
 
         def lines(file: TextIO) -> Iterator[str]:
             nonlocal ended
@@ -550,10 +86,13 @@ class CsvTable(Table):
                     return
                 except csv.Error:
                     raise self._no_table(reader.line_num) from None
-                if not any(cell.strip() for cell in cells) or cells[0].startswith('#'):
+                if not any(cell.strip() for cell in cells) or _is_aside(cells[0]):
                     continue
                 if self._kind:
                     header_seen = cells[0] == self._kind
+                if header_seen and to_skip:
+                    to_skip = False
+                    continue
                 if header_seen:
                     if len(cells) < width and not ended:
                         self.cut_line = reader.line_num
@@ -567,6 +106,21 @@ class CsvTable(Table):
 
     def _open(self) -> TextIO:
         return self.path.open(encoding=self._encoding, errors='replace', newline='')
+
+
+def _is_aside(line: str) -> bool:
+    """Whether a line is a comment, or names the delimiter, as spreadsheets write."""
+    return line.startswith('#') or re.match('sep=.?$', line.strip().lower()) is not None
+
+
+def _units_of(cells: Sequence[str], headers: Sequence[str]) -> list[str]:
+    """The units of the columns where the row below the headers holds them, else nothing. Headers
+    with a unit keep it."""
+    words = [cell.strip().strip('[]()').strip() for cell in cells]
+    known = [bool(unit_of(f'a [{word}]') or time_unit_of(f'a {word}')) for word in words]
+    if len(cells) != len(headers) or not any(known) or any(map(re.compile(r'\d').search, words)):
+        return []
+    return ['' if unit_of(header) else word for word, header in zip(words, headers)]
 
 
 def _lines(file: TextIO) -> Iterator[str]:

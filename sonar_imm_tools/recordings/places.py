@@ -21,9 +21,9 @@ from sonar_imm.acoustics.geodesy import NEAR_ZERO, Origin
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
 from sonar_imm.estimation.arrays import FloatArray
 
-from .columns import FROM_BOW, FROM_NORTH, plain, sign_of, unit_of
-from .csv_table import NUMBER, Row, Table
+from .columns import FROM_BOW, FROM_NORTH, LEVEL, plain, sign_in, sign_of, SLANT, unit_of
 from .sources import BagError
+from .tables import NUMBER, Row, Table
 from .times import BadRow
 
 
@@ -78,6 +78,12 @@ class Degrees:
                 f"'{name}={table.header(name)}' or --ignore {name}"
             )
         values = {axis: self._first_values(table, axis) for axis in _AXES}
+        self._stated = {
+            axis: None
+            if (values[axis] < 0.0).any()
+            else sign_in(axis, table.header(self._names[axis]))
+            for axis in _AXES
+        }
         latitude, longitude = (np.abs(values[axis]) for axis in _AXES)
         limits = (latitude, 90.0), (longitude, 360.0)
         beyond = [len(each) and 2.0 * np.mean(each > limit) > 1.0 for each, limit in limits]
@@ -133,14 +139,22 @@ class Degrees:
                 raise BadRow(f"{row.table.header(name)} is '{row.text(name)[:40]}'")
             value = -value if minus == '-' else value
             words = [word for word in (before, behind) if word]
+        for part, sixtieth in (('minutes', 60.0), ('seconds', 3600.0)):
+            own = row.optional(f'{name}_{part}') if row.table.has(f'{name}_{part}') else 0.0
+            if not 0.0 <= own < 60.0:
+                header = row.table.header(f'{name}_{part}')
+                raise BadRow(f"{header} is '{row.text(f'{name}_{part}')[:40]}', not 0 to 60")
+            value += math.copysign(own / sixtieth, -1.0 if text.startswith('-') else 1.0)
         if self.packed and (found is None or numbers[1] is None):
             whole = math.floor(abs(value) / 100.0)
             value = math.copysign(whole + (abs(value) - 100.0 * whole) / 60.0, value)
-        own: dict[str, float] = {}
+        letters: dict[str, float] = {}
         if (beside := self._signs[axis]) is not None:
-            column, own = beside
+            column, letters = beside
             words.append(row.text(column) or 'nothing')
-        signs = {own.get(word.lower()) or sign_of(axis, word) for word in words}
+        signs = {letters.get(word.lower()) or sign_of(axis, word) for word in words}
+        if not words and (stated := self._stated[axis]) is not None:
+            value = stated * value
         for sign in signs:
             if sign is None or len(signs) > 1 or value < 0.0 < sign:
                 raise BadRow(
@@ -209,6 +223,9 @@ class LocalFrame:
 
     def __init__(self, table: Table, origin: tuple[float, ...] | None = None):
         metres = table.has('x', 'y')
+        if metres and table.has('latitude', 'longitude') and _are_hemispheres(table):
+            del table.index['x'], table.index['y']
+            metres = False
         self.geodetic = table.has('latitude', 'longitude') and (
             not metres or table.is_blank('x', 'y')
         )
@@ -251,12 +268,24 @@ class LocalFrame:
     def _from_geodetic(
         self, latitude: float, longitude: float, row: Row
     ) -> tuple[float, float, float]:
-        height = row.optional('height') if row.table.has('height') else row.height()
+        beside = any(
+            name in row.table.index and row.table.first_cells(row.table.index[name])
+            for name in ('z', 'depth')
+        )  # an altitude beside a depth is that over the ground
+        of_sea = row.table.has('height') and not beside
+        height = row.optional('height') if of_sea else row.height()
         height = 0.0 if math.isnan(height) else height
         if self.origin is None:
             self.origin = (latitude, longitude, 0.0)
         east, north, up = Origin(*self.origin).local(latitude, longitude, height).tolist()
         return east, north, up
+
+
+def _are_hemispheres(table: Table) -> bool:
+    """Say whether x and y, as ``E`` and ``N`` are taken for, are the hemispheres of degrees."""
+    pairs = ('longitude', 'x'), ('latitude', 'y')
+    cells = [(axis, table.first_cells(table.index[name])) for axis, name in pairs]
+    return all(found and all(sign_of(axis, cell) for cell in found) for axis, found in cells)
 
 
 def _ask_for_places(table: Table) -> None:
@@ -298,7 +327,10 @@ def checked_origin(origin: tuple[float, ...] | None) -> tuple[float, float, floa
 
 BEARINGS = ('bow', 'north', 'east')
 """Where bearings count from: clockwise from the bow or from north, counter-clockwise from east."""
+RANGES = ('', 'slant', 'horizontal')
 _TURN = 6.3
+_LEAST, _SHARE = 1.0, 0.05
+"""A depth matters where a slant range and a horizontal one differ by more: m, share of it."""
 
 
 def bearings_from(table: Table, stated: str | None, usual: str) -> str:
@@ -329,20 +361,45 @@ class PolarRows:
         counted_from: str,
         range_std: float | None = None,
         bearing_std_deg: float | None = None,
+        ranges: str = '',
     ):
         table.require('range', 'bearing')
         for name, other in (('std_range', 'std_bearing'), ('std_bearing', 'std_range')):
             if table.has(name) and (range_std, bearing_std_deg) == (None, None):
                 table.require(other)
         self._table, self._counted_from = table, counted_from
-        stated = bool(unit_of(table.header('bearing')))
+        stated = bool(unit_of(table.with_unit('bearing')))
         self._unit = 1.0 if stated else math.radians(1.0)
         self._std_unit = table.factor('bearing') if stated else self._unit
-        if unit_of(table.header('std_bearing')):
+        if unit_of(table.with_unit('std_bearing')):
             self._std_unit = 1.0
         self._range_std = math.nan if range_std is None else range_std
         self._bearing_std = math.nan if bearing_std_deg is None else math.radians(bearing_std_deg)
         self._largest = 0.0
+        self._slant = (ranges or self._kind_of_ranges()) == 'slant'
+
+    def _kind_of_ranges(self) -> str:
+        """Whether ranges are slant or horizontal by their header, or where the depth hardly
+        matters. Raises `BagError`."""
+        header = self._table.header('range')
+        for kind, words in (('slant', SLANT), ('horizontal', LEVEL)):
+            if any(word.startswith(words) for word in plain(header).split('_')):
+                return kind
+        pairs = []
+        for row in self._table.first_rows:
+            with suppress(BadRow):
+                pairs.append((row.number('range'), abs(row.height())))
+        if not pairs:
+            return 'horizontal'
+        far, deep = np.array(pairs).T
+        apart = far - np.sqrt(np.maximum(far**2 - deep**2, 0.0))
+        if np.median(apart - np.maximum(_LEAST, _SHARE * far)) > 0.0:
+            raise BagError(
+                f'{self._table.path}: {header} may be along the ray or in the plane, which differ '
+                f'by {np.median(apart):.3g} m at these depths; say --ranges slant or --ranges '
+                'horizontal'
+            )
+        return 'horizontal'
 
     def place(self, row: Row) -> tuple[FloatArray, FloatArray | None]:
         """x and y (2,), m, and covariance (2, 2) or None. Raises `BadRow`."""
@@ -352,10 +409,15 @@ class PolarRows:
         if abs(bearing) * self._unit > 2.0 * _TURN:
             raise BadRow(f'{row.table.header("bearing")} is {bearing:g}, more than two turns')
         self._largest = max(self._largest, abs(bearing))
+        slant, height = distance, row.height() if self._slant else 0.0
+        if abs(height) > slant:
+            raise BadRow(f'the range {slant:g} m is less than the depth {abs(height):g} m')
+        distance = math.sqrt(slant**2 - height**2)
         angle = bearing * self._unit
         angle = {'bow': -angle, 'north': 0.5 * math.pi - angle, 'east': angle}[self._counted_from]
         std_range, std_bearing = row.optional('std_range'), row.optional('std_bearing')
         std_range = std_range if std_range > 0.0 else self._range_std
+        std_range *= slant / max(distance, 0.05 * slant) if slant else 1.0
         std_bearing = std_bearing * self._std_unit if std_bearing > 0.0 else self._bearing_std
         if math.isnan(std_range + std_bearing):
             return distance * np.array([math.cos(angle), math.sin(angle)]), None
@@ -366,7 +428,7 @@ class PolarRows:
     def check_unit(self) -> None:
         """Raise `BagError` where neither the header nor the bearings say degrees or radians."""
         header = self._table.header('bearing')
-        if not unit_of(header) and 0.0 < self._largest <= _TURN:
+        if not unit_of(self._table.with_unit('bearing')) and 0.0 < self._largest <= _TURN:
             raise BagError(
                 f'{self._table.path}: {header} may be degrees or radians, none is beyond '
                 f'{self._largest:.3g}; write bearing_deg or bearing_rad in the header'

@@ -331,6 +331,7 @@ class _Clock:
             file.attributes(getattr(fields, name))[:].astype(np.int64) for name in names
         )
         clock = 3600 * hour + 60 * minute + second
+        year = np.where((year >= 1) & (year < 100), year + np.where(year < 70, 2000, 1900), year)
         if ((year < 1) | (year > 9999) | (day < 1)).any():
             return self._undated(clock, questions)
         date = (year - 1970).astype('datetime64[Y]').astype('datetime64[D]').astype(np.int64)

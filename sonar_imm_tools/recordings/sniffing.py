@@ -21,10 +21,11 @@ from sonar_imm.trackers import SYSTEMS
 from .convert.archives import NAMES as SNAPSHOT_NAMES
 from .convert.arrivals import name_columns, names_tags
 from .convert.nmea import SENTENCE
-from .csv_table import CsvOptions, CsvTable
+from .csv_table import CsvTable
 from .reader import BagReader
 from .segy_lines import is_segy
 from .sources import BagError, is_recording, quoted, start_of, SUFFIXES
+from .tables import CsvOptions
 from .topics import made_topics
 from .track_files import kind_of_text
 

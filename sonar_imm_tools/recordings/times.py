@@ -23,7 +23,7 @@ from sonar_imm.estimation.arrays import FloatArray, IntArray
 from .columns import plain
 from .sources import BagError
 
-_ZONE = r'\s*(Z|UTC|GMT|[+-]\d\d:?\d\d)?$'
+_ZONE = r'\s*(Z|UTC|GMT|[+-]\d\d(?::?\d\d)?)?$'
 TIME_TEXT = re.compile(r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)([.,]\d+)?' + _ZONE)
 _COMPACT = re.compile(r'(\d{4})(\d\d)(\d\d)[T ]?(\d\d)(\d\d)(\d\d)([.,]\d+)?' + _ZONE)
 TIME_OF_DAY = re.compile(r'(\d\d?):(\d\d)(?::(\d\d))?([.,]\d+)?\s*(?:([AaPp])\.?[Mm]\.?)?' + _ZONE)
@@ -37,8 +37,11 @@ _MONTHS = (
 """How the names of the months begin."""
 
 HHMMSS = 'HHMMSS'
-DAYS = {'datenum': 719529, 'excel': 25569}
-"""Days from day 0 of MATLAB and of spreadsheets to 1970."""
+DAYS = {
+    'datenum': Decimal(719529), 'excel': Decimal(25569), 'julian': Decimal('2440587.5'),
+    'mjd': Decimal(40587),
+}  # fmt: skip
+"""Days from day 0 of MATLAB, of spreadsheets and of the Julian calendar to 1970."""
 _DAYS_SINCE_1900 = (25000, 73000)
 """Days of 1968 to 2099 by a spreadsheet."""
 SHORTEST_STEP = 2e-3
@@ -78,8 +81,8 @@ def zone_of(name: str) -> tzinfo:
     `BagError`."""
     if name.upper() in ('Z', 'UTC', 'GMT'):
         return timezone.utc
-    if offset := re.match(r'([+-])(\d\d):?(\d\d)$', name):
-        hours, minutes = int(offset.group(2)), int(offset.group(3))
+    if offset := re.match(r'([+-])(\d\d):?(\d\d)?$', name):
+        hours, minutes = int(offset.group(2)), int(offset.group(3) or 0)
         if hours < 24 and minutes < 60:
             ahead = timedelta(hours=hours, minutes=minutes)
             return timezone(ahead if offset.group(1) == '+' else -ahead)
@@ -109,6 +112,12 @@ def iso_ns(date: str, clock: str, fraction: str | None, zone: tzinfo) -> int:
         moment = datetime.fromisoformat(f'{date}T{clock}').replace(tzinfo=zone)
     except ValueError:
         raise BadRow(f"'{date} {clock}' is no date and time of the calendar") from None
+    if moment.utcoffset() != moment.replace(fold=1).utcoffset():
+        raise BadRow(
+            f"'{date} {clock}' is twice, or not at all, on the clocks of {zone}, which are set "
+            'then; say --time-zone with an offset, e.g. +01:00',
+            'clock change',
+        )
     elapsed = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
     nanoseconds = (elapsed.days * 86400 + elapsed.seconds + leap) * 10**9
     return nanoseconds + round(Decimal('0.' + (fraction or '.0')[1:]) * 10**9)
@@ -222,8 +231,18 @@ def form_of(header: str, cells: Sequence[str], with_date: bool) -> str:
             'seconds; say --time-unit HHMMSS or --time-unit s'
         )
     steps = sorted(abs(after - before) for before, after in itertools.pairwise(values))
-    if steps and steps[len(steps) // 2] < SHORTEST_STEP and any('.' in cell for cell in numbers):
+    step = steps[len(steps) // 2] if steps else 0.0
+    if with_date and 0.0 <= min(values) and max(values) <= 86400.0:
+        unit = 'excel' if max(values) < 1.0 and step < SHORTEST_STEP else 's'
+        counted = 'parts of a day' if unit == 'excel' else 'seconds'
+        raise BagError(
+            f'{header} holds numbers such as {cells[0]} beside a date, which may be {counted} '
+            f'since midnight, or seconds without a date; say --time-unit {unit} or --ignore date'
+        )
+    if steps and any('.' in cell for cell in numbers):
         for name, zero in DAYS.items():
+            if step >= (0.5 if zero > 10**5 else SHORTEST_STEP):
+                continue
             first, last = (day - DAYS['excel'] + zero for day in _DAYS_SINCE_1900)
             if first <= min(values) and max(values) <= last:
                 raise BagError(

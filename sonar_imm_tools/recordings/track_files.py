@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from .csv_table import CsvOptions, CsvTable, Table
+from .csv_table import CsvTable
 from .sources import BagError, start_of
+from .tables import CsvOptions, Table
 
 LARGEST_JSON = 200_000_000
 """Bytes of a GeoJSON file, which is read as a whole."""

@@ -25,9 +25,9 @@ from sonar_imm.truth import TrueTrack, Truth
 
 from .conversion import ConversionReport, converter, flags_of, Record, write_bag
 from .convert_options import TruthOptions
-from .csv_table import CsvOptions, Row
 from .messages import ros_message
 from .places import LocalFrame
+from .tables import CsvOptions, Row
 from .track_files import open_table
 
 TRUTH_TOPIC = '/truth/estimate'

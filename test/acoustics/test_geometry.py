@@ -177,15 +177,6 @@ def sonar_motion(rows):
     return m, velocity, turn, before.R
 
 
-def test_differential_form(moved):
-    motion = sonar_motion(moved)
-    for model in geometry.AZIMUTH_MODELS:
-        rate = rates(*motion, model)
-        assert_allclose(rate.d, moved['f_range_rate'], **EXACT)
-        assert_allclose(rate.delta, moved[f'f_delta_{model}_rate'], **EXACT)
-        assert_allclose(rate.d_st, moved['f_dst_rate'], **EXACT)
-
-
 @pytest.mark.parametrize('model', geometry.AZIMUTH_MODELS)
 def test_differential_form_is_the_derivative_of_the_exact_one(moved, model):
     """Poses a microsecond apart, turned by the exponential map."""
@@ -200,18 +191,6 @@ def test_differential_form_is_the_derivative_of_the_exact_one(moved, model):
         images.append([*geometry.project(seen, model), geometry.vertical_offset(seen, after.R)])
     slope = (np.array(images[1]) - np.array(images[0])) / (2.0 * h)
     assert_allclose(slope, np.array(rates(m, velocity, turn, R, model)), atol=1e-7)
-
-
-def test_euler_step_of_the_paper_misses_more_than_the_sonar(moved):
-    """The reason for the exact form: at 1 s the Euler step is off by more than 0.18 degrees."""
-    rate = rates(*sonar_motion(moved))
-    error = moved['delta_plane0'] + moved['dt'] * rate.delta - moved['delta_plane1']
-    rms = {
-        dt: np.degrees(np.sqrt(np.mean(error[np.isclose(moved['dt'], dt)] ** 2)))
-        for dt in np.unique(moved['dt'])
-    }
-    assert rms[0.1] < 0.02
-    assert rms[1.0] > 0.18
 
 
 def test_slerp_against_scipy():
@@ -243,15 +222,3 @@ def test_slerp_goes_on_at_the_same_rate():
     q0, q1 = Rotation.from_euler('z', [[0.0], [10.0]], degrees=True).as_quat()
     on = geometry.euler_angles(geometry.rotation_of_quaternion(geometry.slerp(q0, q1, 1.5)))
     assert_allclose(np.degrees(on), [0.0, 0.0, 15.0], atol=1e-12)
-
-
-@pytest.mark.parametrize('mistake', ['roll', 'pitch', 'yaw', 'lever', 'mount'])
-def test_the_table_catches_a_wrong_sign(seen, mistake):
-    """Each of these, done wrong, changes the answer by far more than the tolerance."""
-    wrong = seen.copy()
-    for name in wrong.dtype.names:
-        if name == mistake or name.startswith(f'{mistake}_'):
-            wrong[name] = -wrong[name]
-    off = np.abs(sonar_pose(wrong).position - sonar_pose(seen).position).max()
-    off = max(off, np.abs(sonar_pose(wrong).R - sonar_pose(seen).R).max())
-    assert off > 0.1

@@ -19,6 +19,13 @@ from scipy.stats import chi2, kstest
 from sonar_imm.acoustics import multistatic
 from sonar_imm.acoustics.localisation import Candidate, Limits, Localisation, localise, Refusal
 
+
+def scene_of(rx, toa, noise, **more):
+    toa = toa + noise[0] * np.random.default_rng(noise[1]).standard_normal(len(rx))
+    known = {'rx': rx, 'var_toa': np.full(len(rx), SIGMA**2), 'target_z': Z}
+    return {**known, 'toa': toa, 'sound_speed': SOUND_SPEED, **more}
+
+
 SOUND_SPEED, Z, SIGMA = 1500.0, -5.0, 1e-4
 TX = np.array([5.0, -10.0, -2.0])
 RX = np.array(
@@ -38,32 +45,15 @@ TRUTH = np.array([31.0, 42.0])
 
 def active(n, truth=TRUTH, tx=TX, rx=RX, sigma=0.0, seed=0, **more):
     """Arguments of `localise` for n receivers and one transmitter."""
-    transmitters = np.tile(tx, (n, 1))
-    noise = sigma * np.random.default_rng(seed).standard_normal(n)
-    toa = multistatic.range_sum(truth, transmitters, rx[:n], Z) / SOUND_SPEED + noise
-    return dict(
-        rx=rx[:n],
-        toa=toa,
-        var_toa=np.full(n, SIGMA**2),
-        tx=transmitters,
-        target_z=Z,
-        sound_speed=SOUND_SPEED,
-        **more,
-    )
+    tx = np.tile(tx, (n, 1))
+    toa = multistatic.range_sum(truth, tx, rx[:n], Z) / SOUND_SPEED
+    return scene_of(rx[:n], toa, (sigma, seed), tx=tx, **more)
 
 
 def passive(n, truth=TRUTH, rx=RX, sigma=0.0, seed=0, emission=1e9, **more):
     """Arguments of `localise` for n receivers of a tag that emits at an unknown time."""
-    noise = sigma * np.random.default_rng(seed).standard_normal(n)
-    toa = multistatic.slant_range(truth, rx[:n], Z)[0] / SOUND_SPEED + noise + emission
-    return dict(
-        rx=rx[:n],
-        toa=toa,
-        var_toa=np.full(n, SIGMA**2),
-        target_z=Z,
-        sound_speed=SOUND_SPEED,
-        **more,
-    )
+    toa = multistatic.slant_range(truth, rx[:n], Z)[0] / SOUND_SPEED + emission
+    return scene_of(rx[:n], toa, (sigma, seed), **more)
 
 
 def distance2(fix, truth):
@@ -400,12 +390,8 @@ def test_too_few(scene):
 
 def test_rows_that_are_not_measured_are_not_used():
     scene = active(6, sigma=SIGMA, seed=4)
-    good = localise(
-        **{
-            name: value[:4] if name in ('rx', 'tx', 'toa', 'var_toa') else value
-            for name, value in scene.items()
-        }
-    )
+    rows = ('rx', 'tx', 'toa', 'var_toa')
+    good = localise(**{**scene, **{name: scene[name][:4] for name in rows}})
     scene['toa'][4], scene['var_toa'][5] = np.nan, 0.0
     fix = localise(**scene)
     assert_array_equal(fix.used, [True] * 4 + [False] * 2)
@@ -456,25 +442,13 @@ ANY = st.one_of(
 )
 def test_no_input_raises_or_gives_nan(data):
     toa, var_toa, bearing, var_bearing, places, tag = data
-    n = len(toa)
-    places = np.reshape(places, (2, n, 3))
-    places[1, :1] *= 1e300
-    result = localise(
-        places[0],
-        toa,
-        var_toa,
-        tx=None if tag else places[1],
-        bearing=bearing,
-        var_bearing=var_bearing,
-    )
+    rx, tx = np.reshape(places, (2, len(toa), 3))
+    tx[:1] *= 1e300
+    angles = {'bearing': bearing, 'var_bearing': var_bearing}
+    result = localise(rx, toa, var_toa, tx=None if tag else tx, **angles)
     if isinstance(result, Refusal):
-        assert result.reason in (
-            'too_few',
-            'singular_geometry',
-            'poor_fit',
-            'diverged',
-            'out_of_range',
-        )
+        known = {'too_few', 'singular_geometry', 'poor_fit', 'diverged', 'out_of_range'}
+        assert result.reason in known
     else:
         assert np.isfinite(result.position).all() and np.isfinite(result.cost)
         assert np.linalg.eigvalsh(result.covariance)[0] > 0.0

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import gamma
 
-from sonar_imm.acoustics import coherence, loudness, variances
+from sonar_imm.acoustics import loudness, variances
 
 
 def noise_power(rng, bins, staves, *, fading=True):
@@ -111,14 +111,3 @@ def test_the_share_that_differs_from_stave_to_stave_is_measured(staves):
     chosen = np.isfinite(iq).all(axis=1) & (np.arange(2000) != 7)
     assert np.isfinite(variances.decorrelation(iq, chosen))
     assert np.isnan(variances.decorrelation(iq, np.zeros(2000, bool)))
-
-
-def test_coherence_alone_takes_a_loud_diffuse_floor_for_noise():
-    """What the power of the echo is there for."""
-    iq = diffuse(np.random.default_rng(5), 2000, 2, 0.25)
-    gamma_of, _ = coherence.coherence(iq, 2.0)
-    assert coherence.silent_bins(gamma_of, 2, spacing=2.0).mean() > 0.5
-    power = variances.mean_power(iq)
-    level = loudness.loud_level(2, 5, 1e-3)
-    loud = loudness.loud_bins(power, level, bins=5, usable=np.ones(2000, bool))
-    assert loud.mean() > 0.97

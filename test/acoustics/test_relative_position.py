@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 from sonar_imm.acoustics.geometry import Pose, rotation
 from sonar_imm.acoustics.relative_position import Mounting, place, Uncertainty
 
+NOTHING = np.zeros((3, 3))
+
 VESSEL = Pose(np.array([1.0, 2.0, 3.0]), rotation(0.1, -0.05, 0.8))
 MOUNT = Mounting(np.array([2.0, -1.0, -3.0]), rotation(0.0, 0.1, -0.4), 0.05)
 POSITION = np.diag([1.0, 0.5, 0.2]) + 0.1
@@ -30,15 +32,18 @@ def truth(levelled=False):
 
 def claimed(levelled=False, covariance=None):
     """What is stated of the place of a target measured without an error."""
-    return place(
-        VESSEL,
-        Uncertainty(POSITION, ATTITUDE),
-        MOUNT,
-        OFFSET,
-        covariance,
-        levelled=levelled,
-        **STD,
-    ).covariance
+    known = VESSEL, Uncertainty(POSITION, ATTITUDE), MOUNT, OFFSET, covariance
+    return place(*known, levelled=levelled, **STD).covariance
+
+
+def test_what_is_certain_adds_nothing_and_place_and_lever_what_they_are_uncertain_by():
+    std = {'range_std': 1.0, 'angle_std': 1.0}
+    sure, loose = Mounting(MOUNT.lever, MOUNT.R), Mounting(MOUNT.lever, MOUNT.R, 0.3)
+    placed = place(VESSEL, Uncertainty(NOTHING, NOTHING), sure, OFFSET, NOTHING, **std)
+    assert placed.position == pytest.approx(truth())
+    assert not placed.covariance.any()
+    placed = place(VESSEL, Uncertainty(POSITION, NOTHING), loose, OFFSET, NOTHING, **std)
+    assert placed.covariance == pytest.approx(POSITION + 0.09 * np.eye(3))
 
 
 def draws(count, rng, *, levelled=False, angle_std=STD['angle_std'], covariance=None):
@@ -107,9 +112,8 @@ def test_along_the_line_of_sight_the_bend_counts():
 def test_jacobian_of_the_attitude():
     """The covariance to first order against differences of the place."""
     tiny = np.diag([1e-12, 4e-12, 9e-12])
-    nothing = np.zeros((3, 3))
     exact = {'range_std': 1e-9, 'angle_std': 1e-9}
-    C = place(VESSEL, Uncertainty(nothing, tiny), MOUNT, OFFSET, nothing, **exact).covariance
+    C = place(VESSEL, Uncertainty(NOTHING, tiny), MOUNT, OFFSET, NOTHING, **exact).covariance
     C = C - MOUNT.lever_std**2 * np.eye(3)
     columns = []
     for axis in np.eye(3):
@@ -124,40 +128,7 @@ def test_jacobian_of_the_attitude():
     assert C == pytest.approx(J @ tiny @ J.T, rel=1e-4, abs=1e-13)
 
 
-def test_nothing_is_uncertain_where_nothing_is():
-    nothing = np.zeros((3, 3))
-    sure = Mounting(MOUNT.lever, MOUNT.R)
-    placed = place(
-        VESSEL, Uncertainty(nothing, nothing), sure, OFFSET, nothing, range_std=1.0, angle_std=1.0
-    )
-    assert placed.position == pytest.approx(truth())
-    assert not placed.covariance.any()
-
-
-def test_place_and_lever_add_what_they_are_uncertain_by():
-    nothing = np.zeros((3, 3))
-    loose = Mounting(MOUNT.lever, MOUNT.R, 0.3)
-    placed = place(
-        VESSEL,
-        Uncertainty(POSITION, nothing),
-        loose,
-        OFFSET,
-        nothing,
-        range_std=1.0,
-        angle_std=1.0,
-    )
-    assert placed.covariance == pytest.approx(POSITION + 0.09 * np.eye(3))
-
-
 def test_a_target_at_the_transceiver_has_a_covariance():
-    nothing = np.zeros((3, 3))
-    placed = place(
-        VESSEL,
-        Uncertainty(nothing, nothing),
-        MOUNT,
-        np.zeros(3),
-        None,
-        range_std=0.5,
-        angle_std=0.1,
-    )
+    known = VESSEL, Uncertainty(NOTHING, NOTHING), MOUNT, np.zeros(3), None
+    placed = place(*known, range_std=0.5, angle_std=0.1)
     assert placed.covariance == pytest.approx((0.25 + 0.0025) * np.eye(3))

@@ -22,6 +22,22 @@ from sonar_imm.acoustics.spectra import (
     window_overlap,
 )
 
+
+def test_averages_are_of_the_snapshots_they_say():
+    """Those of blocks share no sample, those that slide are of the last ones."""
+    spectra = spectra_of(pressure())
+    blocks, sliding = BlockAverage(5, 1), SlidingAverage(10, 4)
+    done = [made for part in np.split(spectra, [1, 8, 9]) for made in blocks.push(part)]
+    assert len(done) == (len(spectra) + 1) // 6
+    for k, made in enumerate(done):
+        assert made.csdm == pytest.approx(outer_sum(spectra[6 * k : 6 * k + 5]) / 5, rel=1e-5)
+        assert made.snapshots == 5
+    done = [made for part in np.split(spectra, [3, 11]) for made in sliding.push(part)]
+    assert len(done) == (len(spectra) - 10) // 4 + 1
+    for k, made in enumerate(done):
+        assert made.csdm == pytest.approx(outer_sum(spectra[4 * k : 4 * k + 10]) / 10, rel=1e-5)
+
+
 LENGTH, HYDROPHONES = 64, 4
 
 
@@ -62,25 +78,6 @@ def test_a_restart_forgets_half_a_snapshot():
     assert len(stream.push(pressure(LENGTH - 1))) == 0
     with pytest.raises(ValueError):
         stream.push(np.zeros((5, HYDROPHONES + 1)))
-
-
-def test_block_averages_share_no_sample():
-    spectra = spectra_of(pressure())
-    average = BlockAverage(5, 1)
-    done = [made for part in np.split(spectra, [1, 8, 9]) for made in average.push(part)]
-    assert len(done) == (len(spectra) + 1) // 6
-    for k, made in enumerate(done):
-        assert made.csdm == pytest.approx(outer_sum(spectra[6 * k : 6 * k + 5]) / 5, rel=1e-5)
-        assert made.snapshots == 5
-
-
-def test_sliding_averages_are_of_the_last_snapshots():
-    spectra = spectra_of(pressure())
-    average = SlidingAverage(10, 4)
-    done = [made for part in np.split(spectra, [3, 11]) for made in average.push(part)]
-    assert len(done) == (len(spectra) - 10) // 4 + 1
-    for k, made in enumerate(done):
-        assert made.csdm == pytest.approx(outer_sum(spectra[4 * k : 4 * k + 10]) / 10, rel=1e-5)
 
 
 def test_windows_have_unit_power_and_the_autocorrelation_they_claim():

@@ -12,8 +12,7 @@ from helpers.bathymetry_cases import floor
 import numpy as np
 import pytest
 
-from benchmarks.bathymetry_paper import ANGLES, as_printed, PrintedTracker, SETS
-from sonar_imm.trackers.bathymetry.ping import look, Ping, run_particles
+from benchmarks.bathymetry_paper import ANGLES, PrintedTracker, SETS
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 RANGES = 17.0 + 0.05 * np.arange(200)
@@ -48,30 +47,3 @@ def test_the_slope_model_as_printed_is_a_random_walk_in_disguise():
     corrected = rmse(BathymetryTracker(config).process(snapshot)[0], height)
     assert corrected < 0.25
     assert rmse(PrintedTracker(config).process(snapshot)[0], height) > 3.0 * corrected
-
-
-def test_of_the_models_only_the_slope_model_is_another():
-    config, ping = config_of('height_rw_ncs'), floor(0.0, ranges=RANGES)
-    usual = look(Ping(config, ping, None)).models.F
-    printed = as_printed(Ping(config, ping, None)).models.F
-    assert np.argwhere(printed != usual).tolist() == [[1, 1, 1]]
-    assert printed[1, 1, 1] == pytest.approx(0.5 * 0.05**2)
-    walks = Ping(config_of('height_two_rw'), ping, None)
-    assert np.array_equal(as_printed(walks).models.F, look(walks).models.F)
-
-
-def test_watching_the_particles_changes_nothing():
-    ping = floor(0.0, ranges=RANGES)
-    seen = as_printed(Ping(config_of('height_two_rw'), ping, None))
-    watched = []
-
-    def watch(t, particles):
-        watched.append((t, float((particles.mu[:, None] * particles.w * particles.x[:, 0]).sum())))
-
-    track = run_particles(
-        seen.models, seen.likelihood, 100, (0, ping.stamp_ns, 0), resample=True, watch=watch
-    )
-    estimate = PrintedTracker(config_of('height_two_rw')).process(ping)[0]
-    assert np.array_equal(track.mean, estimate.state)
-    assert [t for t, _ in watched] == list(range(len(RANGES)))
-    assert [mean for _, mean in watched] == pytest.approx(track.mean[:, 0], abs=1e-12)

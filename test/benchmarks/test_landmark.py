@@ -9,15 +9,12 @@
 """The baseline in world coordinates: its unscented filter is exact where it must be, indifferent
 to the choice of north, and never without an answer."""
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 
 from benchmarks.landmark import LandmarkTracker, unscented_transform, update
 from benchmarks.obstacle_accuracy import config_of, track
 from sonar_imm.estimation import kalman
-from sonar_imm.estimation.kalman import CovarianceError
 from sonar_imm.estimation.smoothing import sigma_offsets
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
@@ -47,12 +44,6 @@ def test_points_have_the_moments_and_no_negative_weight(n):
     )
 
 
-@pytest.mark.parametrize('n', [1, 2, 3])
-def test_up_to_three_dimensions_the_fourth_moment_is_that_of_a_gaussian(n):
-    offsets, weights = sigma_offsets(np.eye(n))
-    np.testing.assert_allclose(weights @ offsets**4, 3.0, rtol=1e-14)
-
-
 @pytest.mark.parametrize('n', [2, 4, 6])
 def test_linear_functions_give_the_kalman_filter(n):
     rng = np.random.default_rng(n)
@@ -70,50 +61,6 @@ def test_linear_functions_give_the_kalman_filter(n):
     seen = update(x, P, z, lambda points: points @ H.T, R)
     for got, want in zip(seen, kalman.update(x, P, z - x @ H.T, H, R)):
         np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-10)
-
-
-def test_the_mean_of_a_quadratic_is_exact():
-    rng = np.random.default_rng(1)
-    x, P, A = rng.normal(size=4), covariance(rng, 4), rng.normal(size=(4, 4))
-    mean = unscented_transform(
-        lambda p: np.einsum('...i,ij,...j->...', p, A, p)[..., None], x, P
-    ).mean
-    np.testing.assert_allclose(mean, [x @ A @ x + np.trace(A @ P)], rtol=1e-12)
-
-
-@settings(max_examples=60)
-@given(st.floats(-np.pi, np.pi), st.floats(-20.0, 20.0))
-def test_turning_the_scene_turns_the_answer(bearing, turn):
-    """A target at any bearing, all turned by any angle: same range, nis, likelihood; bearing and
-    position turned."""
-    position = 50.0 * np.array([np.cos(bearing), np.sin(bearing)])
-    P, R = np.array([[40.0, 11.0], [11.0, 25.0]]), np.diag([0.5, 0.01])
-    z = np.array([51.0, bearing + 0.05])
-    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    plain = update(position, P, z, range_bearing, R, angles=RANGE_BEARING)
-    turned = update(
-        rotation @ position,
-        rotation @ P @ rotation.T,
-        z + [0.0, turn],
-        range_bearing,
-        R,
-        angles=RANGE_BEARING,
-    )
-    np.testing.assert_allclose(turned.x, rotation @ plain.x, atol=1e-9)
-    np.testing.assert_allclose(turned.P, rotation @ plain.P @ rotation.T, atol=1e-9)
-    np.testing.assert_allclose(turned[2:][0], plain.innovation_covariance, atol=1e-9)
-    np.testing.assert_allclose(
-        [turned.nis, turned.log_likelihood], [plain.nis, plain.log_likelihood], atol=1e-9
-    )
-
-
-@pytest.mark.parametrize(
-    'P, function',
-    [(np.full((2, 2), np.nan), range_bearing), (np.eye(2), lambda points: points * np.inf)],
-)
-def test_what_is_not_finite_is_refused(P, function):
-    with np.errstate(invalid='ignore'), pytest.raises(CovarianceError, match='not finite'):
-        unscented_transform(function, np.array([1.0, 2.0]), P)
 
 
 def test_filterpy_agrees_where_angles_do_not_matter():

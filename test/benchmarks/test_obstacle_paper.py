@@ -10,7 +10,7 @@
 
 from pathlib import Path
 
-from helpers.obstacle_runs import approach, lever, meta, rows
+from helpers.obstacle_runs import approach, lever, meta
 import numpy as np
 import pytest
 
@@ -61,19 +61,6 @@ def test_with_noise_the_curve_is_that_of_the_paper(name):
     assert abs(found.best - GRID[lowest]) <= 0.05
 
 
-def test_a_level_path_gives_a_curve_that_is_its_own_mirror():
-    curve = deferred(*echoes('approach_level_mirror_noisy'), offsets=GRID).rmsd
-    np.testing.assert_allclose(curve, curve[::-1], rtol=1e-9)
-
-
-def test_refitting_the_first_echo_helps():
-    """The paper's open loop hangs on the error of one echo: 6 m for 3 m here."""
-    true = meta('approach_dst+3_noisy')['dst_first_ping']
-    series = echoes('approach_dst+3_noisy')
-    assert abs(deferred(*series, both_sides=True).best - true) > 2.5
-    assert abs(deferred(*series, both_sides=True, refit=True).best - true) < 1.0
-
-
 def test_poses_are_not_invented():
     name = NOISE_FREE[0]
     navigation = [item for item in approach(name) if isinstance(item, Navigation)]
@@ -90,22 +77,6 @@ def test_poses_are_not_invented():
     assert not sonar_poses(wide, stamps[2:3], config)[1][0]
 
 
-def test_what_cannot_be():
-    z, poses, config = echoes(NOISE_FREE[0])
-    with pytest.raises(ValueError, match='two echoes'):
-        deferred(z[:1], Pose(poses.position[:1], poses.R[:1]), config)
-    nowhere = deferred(z, poses, config, offsets=np.array([150.0, 200.0]))
-    assert np.isnan(nowhere.best) and np.isnan(nowhere.rmsd).all()
-    assert len(rows(NOISE_FREE[0])) > len(z)
-
-
-def test_the_paper_looks_below_the_sonar_alone():
-    z, poses, config = echoes('approach_level_mirror_noisy')
-    below, both = deferred(z, poses, config), deferred(z, poses, config, both_sides=True)
-    assert below.offset[0] == 0.0 and both.offset[0] == -both.offset[-1]
-    np.testing.assert_array_equal(both.rmsd[-len(below.rmsd) :], below.rmsd)
-
-
 @pytest.mark.parametrize('body', ['large', 'sphere'])
 @pytest.mark.parametrize('echo', ['hand', 'noisy'])
 def test_curves_of_the_papers_encounters(body, echo):
@@ -118,22 +89,6 @@ def test_curves_of_the_papers_encounters(body, echo):
     found = deferred(z[seen], poses, ObstacleConfig(), offsets=values['d_st'])
     np.testing.assert_allclose(found.rmsd, values[f'{echo}_rmsd'], rtol=1e-9)
     assert found.best == pytest.approx(float(values[f'{echo}_estimate']), abs=0.05)
-
-
-CLEAN = {
-    'ideal_navigation': True,
-    'sound_speed_error': 0.0,
-    'range_std': 0.001,
-    'bearing_std_deg': 0.001,
-    'range_step': 0.0,
-    'bearing_step_deg': 0.0,
-}
-
-
-def test_the_deferred_estimate_of_a_clean_run_finds_the_truth():
-    found = moored(scenario('approach', CLEAN), 1)
-    assert found['truth'] == pytest.approx(3.0, abs=0.2)
-    assert abs(found['RMSD']) < 0.1 and abs(found['refitted']) < 0.1
 
 
 def test_all_estimates_of_a_moored_sphere_hold_at_the_first_echo():

@@ -21,53 +21,31 @@ if not (ROOT / 'docs' / 'reliability.md').is_file():
 GOOD = {
     'bounds': {
         'trace': {
-            'size_mb': 1.6,
-            'cpu_s': 0.4,
-            'memory_mb': 154.0,
-            'cpu_s_per_mb': 0.23,
-            'memory_per_byte': 96.0,
-            'refused': 0.0,
-        }
+            'size_mb': 1.6, 'cpu_s': 0.4, 'memory_mb': 154.0, 'cpu_s_per_mb': 0.23,
+            'memory_per_byte': 96.0, 'refused': 0.0,
+        },
     },
-    'faults': [
-        {
-            'fault': 'a burst',
-            'system': 'diver',
-            'recovered': 2,
-            'limit': 3,
-            'losses': {'count: too_late': 7},
-            'traceback': False,
-        }
-    ],
+    'faults': [{
+        'fault': 'a burst', 'system': 'diver', 'recovered': 2, 'limit': 3,
+        'losses': {'count: too_late': 7}, 'traceback': False,
+    }],
     'signals': [{'system': 'diver', 'signal': 'SIGINT', 'tried': 20, 'clean': 20, 'why': []}],
     'restart': [{'system': 'diver', 'tried': 9, 'again': 14, 'estimates': 70, 'equal': 70}],
     'damage': [{'what': 'full disk', 'tried': 3, 'said': 3, 'silent': 0, 'failed': 0}],
     'flood': [],
     'soak': {
         'diver': {
-            'hours': 24.0,
-            'messages': 86400.0,
-            'memory_mb': 250.0,
-            'slope_mb_per_h': 0.01,
-            'slope_low': 0.0,
-            'slope_high': 0.02,
-            'p99_first_ms': 1.0,
-            'p99_last_ms': 1.1,
+            'hours': 24.0, 'messages': 86400.0, 'memory_mb': 250.0, 'slope_mb_per_h': 0.01,
+            'slope_low': 0.0, 'slope_high': 0.02, 'p99_first_ms': 1.0, 'p99_last_ms': 1.1,
             'uncounted': 0.0,
-        }
+        },
     },
     'soak_live': {},
     'metamorphic': [
-        {
-            'system': 'diver',
-            'how': 'gnn',
-            'moved': 'later',
-            'tolerance': 1e-6,
-            'states': 1e-9,
-        }
+        {'system': 'diver', 'how': 'gnn', 'moved': 'later', 'tolerance': 1e-6, 'states': 1e-9},
     ],
     'hostile': {},
-}
+}  # fmt: skip
 
 
 def test_the_page_says_what_the_results_say():
@@ -168,53 +146,6 @@ def test_parts_are_run_and_what_was_broken_off_goes_on(toy, monkeypatch, capsys)
     assert run(monkeypatch, toy) == 1
     assert run(monkeypatch, toy, '--run', 'signals') == 0
     assert (toy / 'notes').read_text() == 'SIGHUP SIGINT '  # what fell short is tried again
-
-
-def test_the_page_is_of_one_folder_and_says_how_long_it_took(toy, monkeypatch, capsys):
-    old = [{'system': 'obstacle', 'signal': 'SIGINT', 'tried': 9, 'clean': 9, 'why': []}]
-    reliability.RESULT.write_text(json.dumps({'signals': old}))
-    assert run(monkeypatch, toy) == 1  # no part is there: file and page stay
-    assert json.loads(reliability.RESULT.read_text()) == {'signals': old}
-    assert run(monkeypatch, toy, '--run') == 0
-    result = json.loads(reliability.RESULT.read_text())
-    assert [row['system'] for row in result['signals']] == ['diver', 'diver']
-    assert result['run']['signals']['seconds'] > 0.0
-    page = reliability.PAGE.read_text()
-    assert 'One run of 20' in page and '; minutes of each part: `signals` 0.0.' in page
-    capsys.readouterr()
-    result['run']['signals']['commits'] = ['a', 'b']
-    (toy / 'run.json').write_text(json.dumps(result['run']))
-    assert run(monkeypatch, toy) == 1
-    assert 'parts are of 2 versions' in capsys.readouterr().out
-
-
-def test_a_try_of_the_machinery_leaves_the_page_alone(toy, monkeypatch):
-    monkeypatch.setattr(reliability, 'SHARE', 0.1)
-    before = reliability.PAGE.read_text()
-    assert run(monkeypatch, toy, '--run') == 0
-    assert reliability.PAGE.read_text() == before and not reliability.RESULT.exists()
-    assert '`SHARE` 0.1; minutes of each part' in (toy / 'page.md').read_text()
-
-
-def test_of_moved_scenes_the_hardest_is_shown():
-    some = {'system': 'diver', 'how': 'gnn'}
-    scenes = [
-        {**some, 'moved': 'later', 'tolerance': 0.0, 'states': 0.0},
-        {**some, 'moved': 'turned', 'tolerance': 1e-5, 'states': 1e-9},
-        {**some, 'moved': 'mirrored', 'tolerance': 1e-7, 'states': 5e-10},
-    ]
-    sentence = reliability.SENTENCES['metamorphic'](scenes)
-    assert sentence.startswith('3 pairs') and '0.005 of' in sentence and 'mirrored' in sentence
-
-
-def test_faults_that_do_the_same_share_a_row():
-    rows = [
-        {'fault': fault, 'system': 'diver', 'recovered': recovered, 'losses': {}}
-        for fault, recovered in (('a burst', 0), ('a reset', 2), ('a loop', 0))
-    ]
-    _, *body = reliability.table_of('faults', rows)
-    assert [row[0] for row in body] == ['a burst; a loop', 'a reset']
-    assert [row[2] for row in body] == ['0', '2']
 
 
 def test_every_part_has_a_program_and_is_shown():

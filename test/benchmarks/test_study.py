@@ -13,11 +13,9 @@ from datetime import date
 import json
 import math
 import os
-from pathlib import Path
 
 from attrs import evolve
 from helpers.source import ROOT
-import numpy as np
 import pytest
 
 from benchmarks import study
@@ -66,49 +64,11 @@ def test_the_file_holds_what_is_known_when_a_run_is_broken_off(monkeypatch, tmp_
     assert study.known(tmp_path / 'none') == study.known(None) == {}
 
 
-def test_a_study_may_read_its_own_file(monkeypatch, tmp_path):
-    def again(out: Path | None = None) -> study.Parts:
-        yield (before := study.known(out))
-        yield {'times': before.get('times', 0) + 1}
-
-    for _ in range(2):
-        run(monkeypatch, again, '--out', tmp_path / 'numbers.json')
-    assert study.known(tmp_path / 'numbers.json') == {'times': 2}
-
-
 @pytest.mark.parametrize('words', [['--cases', 'd'], ['--runs', 'many'], ['--none', '1']])
 def test_a_wrong_option_is_refused(monkeypatch, words):
     with pytest.raises(SystemExit) as ended:
         run(monkeypatch, numbers, *words, cases={'choices': ['a', 'b']})
     assert ended.value.code == 2
-
-
-def test_what_is_shown_of_a_row_can_be_chosen(monkeypatch, capsys):
-    def nested() -> study.Parts:
-        yield {'cases': {'a': {'deep': {'error': 1.0}}, 'b': {'deep': {'error': 2.0}}}}
-
-    run(monkeypatch, nested, shown=lambda row: {'error': row['deep']['error']}, digits=1)
-    assert '| b | 2.0 |' in capsys.readouterr().out
-
-
-def test_rows_of_other_columns_have_a_table_of_their_own():
-    text = study.markdown({'a': {'x': 1.0}, 'b': {'x': 2.0}, 'c': {'y': 'z'}}, 1)
-    assert text == '| | x |\n|---|---|\n| a | 1.0 |\n| b | 2.0 |\n\n| | y |\n|---|---|\n| c | z |'
-
-
-def test_lists_of_rows_are_tables_and_grow():
-    content = {'rows': [{'n': 1}]}
-    study.merge(content, {'rows': [{'n': 2}]})
-    assert dict(study.tables(content)) == {'rows': {'1': {'n': 1}, '2': {'n': 2}}}
-
-
-def test_means_and_errors():
-    rows = [{'a': 1.0, 'b': 2.0}, {'a': 3.0, 'b': 2.0}]
-    assert study.mean_of(rows) == {'a': 2.0, 'b': 2.0}
-    assert study.standard_error([1.0]) == 0.0
-    values = np.random.default_rng(0).normal(size=50)
-    assert study.standard_error(values) == pytest.approx(values.std(ddof=1) / np.sqrt(50.0))
-    assert study.rms([3.0, -4.0]) == pytest.approx(np.sqrt(12.5))
 
 
 def test_a_fresh_process_is_another_one_and_its_errors_arrive():
@@ -200,20 +160,6 @@ def test_a_run_that_fails_gives_the_same_sentence_each_time(monkeypatch):
     assert first.failure.startswith("scene has no topic '/nowhere'")
     monkeypatch.setattr(diver, 'simulate', broken)
     assert study.run_seed(plan, 0).failure == 'ZeroDivisionError: division by zero'
-
-
-def test_nested_metrics_become_flat_numbers():
-    metrics = {
-        'n': 3,
-        'a': {'b': {'c': 0.5, 'd': math.nan}, 'ok': True},
-        'name': 'x',
-        'none': None,
-        'list': [1.0],
-        'far': math.inf,
-    }
-    given = study.finite_numbers(metrics)
-    assert given == {'n': 3, 'a.b.c': 0.5, 'a.ok': 1}
-    assert type(given['a.ok']) is int  # not True in a table
 
 
 @pytest.mark.filterwarnings('error')  # one run has no spread, and says nothing on the terminal

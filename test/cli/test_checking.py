@@ -44,15 +44,10 @@ def check(dive, tmp_path, monkeypatch):
             counts = Counts(40, 1, len(estimates))
             return LockstepResult(
                 **{
-                    'estimates': estimates,
-                    'counts': counts,
-                    'delays': (0.001,),
-                    'exit_code': 0,
-                    'log': '',
-                    'problems': (),
-                    **facts,
+                    'estimates': estimates, 'counts': counts, 'delays': (0.001,), 'exit_code': 0,
+                    'log': '', 'problems': (), **facts,
                 }
-            )
+            )  # fmt: skip
 
         monkeypatch.setattr(checking, 'run_lockstep', played)
         checked = checking.play_recording(dive, 'diver', tmp_path, quiet=True).judged()

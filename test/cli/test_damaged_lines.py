@@ -12,12 +12,12 @@ import json
 import os
 import shutil
 
+from helpers.commands import contents, run
 import pytest
 import rasterio
 
 from sonar_imm.files import mark
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm_tools.cli import main
 from sonar_imm_tools.survey.making import sources_of
 
 pytest.importorskip('rasterio')
@@ -67,10 +67,6 @@ TABLES = {
     'table_header': b'stamp_ns,x\n1,2\n',
     'table_nul': b'stamp_ns\0',
 }
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope='module')
@@ -290,11 +286,3 @@ def test_tiles_that_lie_behind_a_link_stay(good, tmp_path, capsys):
     assert run('survey', good, out, '--overwrite') == 0
     assert [path.name for path in charts.iterdir()] == ['L9_9_9.tif']
     assert (out / 'tiles').is_dir() and not (out / 'tiles').is_symlink()
-
-
-def contents(folder):
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob('*')
-        if path.is_file()
-    }

@@ -10,19 +10,15 @@
 
 import json
 
+from helpers.commands import run
 from helpers.report_pages import figures
 import numpy as np
 import pytest
 
-from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.export.points import read_points
 from sonar_imm_tools.survey.chart import OF_ONE_RUN
 
 SMALL = ('--set', 'pings=3', '--set', 'last_range=30', '--set', 'bin_width=0.1')
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope='module')

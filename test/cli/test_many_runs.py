@@ -14,6 +14,7 @@ import json
 from pathlib import Path
 
 from helpers.clusters import small_cluster
+from helpers.commands import contents
 from helpers.dive_bags import write_dive
 from helpers.source import ROOT
 import pytest
@@ -63,12 +64,8 @@ def two_ships(swaths, tmp_path):
     )
 
 
-def contents(folder):
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in Path(folder).rglob('*')
-        if path.is_file() and path.name not in ('run.json', 'summary.json')
-    }
+def made_in(folder):
+    return contents(folder, 'run.json', 'summary.json')
 
 
 def track(*arguments):
@@ -91,7 +88,7 @@ def test_words_in_a_name_tell_the_side(swaths, tmp_path):
         '/sidescan_stbd/snapshot': 'starboard/snapshot',
     }
     assert track(bag, tmp_path / 'words', *EXACT) == 0 == track(swaths, tmp_path / 'own', *EXACT)
-    assert contents(tmp_path / 'words') == contents(tmp_path / 'own')
+    assert made_in(tmp_path / 'words') == made_in(tmp_path / 'own')
 
 
 def test_instruments_are_told_apart_and_share_what_is_nobodys(tmp_path):
@@ -117,8 +114,8 @@ def test_every_instrument_is_tracked_as_if_it_were_alone(swaths, two_ships, tmp_
     assert track(two_ships, out, *EXACT, '--jobs', '2') == 0
     assert '2 runs in' in capsys.readouterr().out
     assert track(swaths, tmp_path / 'alone', *EXACT) == 0
-    alone = contents(tmp_path / 'alone')
-    assert contents(out / 'fore') == contents(out / 'aft_sidescan') == alone
+    alone = made_in(tmp_path / 'alone')
+    assert made_in(out / 'fore') == made_in(out / 'aft_sidescan') == alone
     summary = json.loads((out / 'summary.json').read_text())
     assert [run['folder'] for run in summary['runs']] == ['aft_sidescan', 'fore']
     assert all(run['estimates'] == 6 and run['state'] == 'tracked' for run in summary['runs'])
@@ -149,7 +146,7 @@ def test_the_same_command_again_makes_only_what_is_missing(tmp_path, capsys):
     bags = [write_dive(tmp_path / name, count=30, spoilt=range(k)) for k, name in enumerate('abc')]
     out = tmp_path / 'out'
     assert track(*bags, out) == 0
-    first, times = contents(out), {path: path.stat().st_mtime_ns for path in out.rglob('*.csv')}
+    first, times = made_in(out), {path: path.stat().st_mtime_ns for path in out.rglob('*.csv')}
     (out / 'a' / 'run.json').unlink()  # as if killed
     (out / 'c' / 'estimate.csv').unlink()
     (out / 'c' / 'run.json').unlink()
@@ -157,7 +154,7 @@ def test_the_same_command_again_makes_only_what_is_missing(tmp_path, capsys):
     assert track(*bags, out, '--json', '--jobs', '2') == 0
     states = [run['state'] for run in json.loads(capsys.readouterr().out)['runs']]
     assert states == ['tracked', 'kept', 'tracked']
-    assert contents(out) == first
+    assert made_in(out) == first
     assert (out / 'b' / 'estimate.csv').stat().st_mtime_ns == times[out / 'b' / 'estimate.csv']
     # Another parameter, another recording, another version: refused, and by --overwrite made anew.
     assert track(*bags, out, '--set', 'detection_probability=0.8') == 1
@@ -204,7 +201,7 @@ def test_bags_on_a_cluster(tmp_path, capsys):
         address = ('--scheduler', there.scheduler_address)
         assert track(*bags, tmp_path / 'missing', tmp_path / 'there', *address) == 1
         assert 'missing does not exist' in capsys.readouterr().err
-        assert contents(tmp_path / 'there') == contents(tmp_path / 'here')
+        assert made_in(tmp_path / 'there') == made_in(tmp_path / 'here')
         capsys.readouterr()
         assert track(*bags, tmp_path / 'there', *address) == 0
         assert '2 kept' in capsys.readouterr().out
@@ -235,8 +232,8 @@ def test_shards_share_the_bags_out(tmp_path, capsys):
     runs = json.loads((out / 'summary-2-of-2.json').read_text())['runs']
     assert [run['folder'] for run in runs] == ['b']
     assert track(*bags, tmp_path / 'whole') == 0
-    assert {name: text for name, text in contents(out).items() if 'summary' not in name} == (
-        contents(tmp_path / 'whole')
+    assert {name: text for name, text in made_in(out).items() if 'summary' not in name} == (
+        made_in(tmp_path / 'whole')
     )
     # Downstream all shards are one; a share again makes what is missing; one may be empty.
     capsys.readouterr()
@@ -273,11 +270,11 @@ def test_a_folder_of_tables_becomes_a_folder_of_bags(tmp_path, capsys):
         capsys.readouterr()
         assert main(['convert', 'fixes', str(tables), str(out), '--jobs', jobs]) == 0
         assert '3 bags in' in capsys.readouterr().out
-        made[jobs] = contents(out)
+        made[jobs] = made_in(out)
     assert made['1'] == made['2'] and {Path(name).parts[0] for name in made['1']} == set('abc')
     # The same as one by one; one that fails is named and stops no other.
     assert main(['convert', 'fixes', str(tables / 'b.csv'), str(tmp_path / 'b')]) == 0
-    alone = {f'b/{name}': content for name, content in contents(tmp_path / 'b').items()}
+    alone = {f'b/{name}': content for name, content in made_in(tmp_path / 'b').items()}
     assert alone.items() <= made['1'].items()
     (tables / 'broken.csv').write_text('what\n1\n')
     capsys.readouterr()
@@ -306,7 +303,7 @@ def test_pings_are_shared_out(swaths, tmp_path, capsys, options):
         run = json.loads(capsys.readouterr().out)
         counts.append((run['counts'], run['estimates'], run['messages']))
     assert counts[0] == counts[1] and counts[0][1] == 6
-    assert contents(tmp_path / '1') == contents(tmp_path / '2')
+    assert made_in(tmp_path / '1') == made_in(tmp_path / '2')
 
 
 def test_bags_are_shared_out_and_one_that_fails_stops_no_other(swaths, tmp_path, capsys):
@@ -320,7 +317,7 @@ def test_bags_are_shared_out_and_one_that_fails_stops_no_other(swaths, tmp_path,
         output = capsys.readouterr()
         assert output.err.startswith(f'{broken}: ')
         assert 'Traceback' not in output.err and output.err.count('broken') == 2
-        found.append((contents(tmp_path / jobs), output.out.replace(str(tmp_path / jobs), '')))
+        found.append((made_in(tmp_path / jobs), output.out.replace(str(tmp_path / jobs), '')))
     assert found[0] == found[1]
     assert {name.split('/')[0] for name in found[0][0]} == {'swaths', 'dive'}
     capsys.readouterr()

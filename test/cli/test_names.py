@@ -24,13 +24,9 @@ from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import quoted
 
 NAMES = {
-    'not UTF-8': 'dive\udcff\udcfe.bag',
-    'lines': 'a\nb\r.bag',
-    'quotes': '"\'`$(x) & <b>.bag',
-    'dash': '-x',
-    'escapes': '\x1b[31mred\x07\x9b2J\u202e [bold]',
-    'longest': 'x' * 255,
-}
+    'not UTF-8': 'dive\udcff\udcfe.bag', 'lines': 'a\nb\r.bag', 'quotes': '"\'`$(x) & <b>.bag',
+    'dash': '-x', 'escapes': '\x1b[31mred\x07\x9b2J\u202e [bold]', 'longest': 'x' * 255,
+}  # fmt: skip
 ROWS = 'time,x,y,z\n' + ''.join(f'{1700000000 + k},{0.5 * k},{0.3 * k},0\n' for k in range(20))
 TEXTS = ('.json', '.csv', '.html', '.kml', '.gpx', '.geojson', '.yaml')
 
@@ -169,11 +165,9 @@ def test_any_locale_will_do(tmp_path, locale, name):
         file.write(ROWS)
     environment = {k: v for k, v in os.environ.items() if not k.startswith(('LC_', 'LANG'))}
     done = subprocess.run(
-        [sys.executable, '-c', SESSION, bag],
-        env={**environment, **locale},
-        cwd=ROOT,
+        [sys.executable, '-c', SESSION, bag], env={**environment, **locale}, cwd=ROOT,
         capture_output=True,
-    )
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr.decode('utf-8', 'replace')
     encoding = 'ascii' if locale.get('PYTHONUTF8') == '0' else 'utf-8'
     (done.stdout + done.stderr).decode(encoding)

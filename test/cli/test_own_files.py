@@ -11,22 +11,9 @@
 import json
 import shutil
 
+from helpers.commands import contents, run
 from helpers.dive_bags import write_dive
 import pytest
-
-from sonar_imm_tools.cli import main
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
-
-
-def contents(folder):
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob('*')
-        if path.is_file() and not path.is_symlink()
-    }
 
 
 @pytest.fixture(scope='module')

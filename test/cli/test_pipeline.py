@@ -12,6 +12,7 @@ import csv
 import json
 from pathlib import Path
 
+from helpers.commands import contents
 from helpers.dive_bags import write_dive
 import pytest
 
@@ -38,14 +39,6 @@ def dive(tmp_path_factory):
     return write_dive(folder / 'dive', count=60, spoilt=(30, 31), shuffle=True)
 
 
-def contents(folder):
-    return {
-        path.relative_to(folder): path.read_bytes()
-        for path in folder.rglob('*')
-        if path.is_file() and path.name != 'run.json'
-    }
-
-
 def test_track_twice_writes_the_same_bytes_and_accounts_for_every_message(
     call, dive, tmp_path, capsys
 ):
@@ -61,11 +54,11 @@ def test_track_twice_writes_the_same_bytes_and_accounts_for_every_message(
         stamps = [int(row['stamp_ns']) for row in csv.DictReader(file)]
     assert stamps == sorted(stamps) and len(stamps) == 58
     # A run is not overwritten by accident.
-    first = contents(tmp_path / 'out')
+    first = contents(tmp_path / 'out', 'run.json')
     assert main(['track', str(dive), str(tmp_path / 'out')]) == 2
     assert '--overwrite' in capsys.readouterr().err
     call('track', dive, tmp_path / 'out', '--overwrite')
-    assert contents(tmp_path / 'out') == first and len(first) == 4
+    assert contents(tmp_path / 'out', 'run.json') == first and len(first) == 4
 
 
 def test_evaluate_scores_and_reports(call, tmp_path):

@@ -28,14 +28,9 @@ from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main
 
 PROMISE = {
-    'bathymetry': 1e-10,
-    'bathymetry_ledge': 1e-6,
-    'diver': 1e-10,
-    'obstacle': 1e-7,
-    'fathometer': 1e-9,
-    'fathometer_drift': 2e-5,
-    'fathometer_pressure': 0.05,
-}
+    'bathymetry': 1e-10, 'bathymetry_ledge': 1e-6, 'diver': 1e-10, 'obstacle': 1e-7,
+    'fathometer': 1e-9, 'fathometer_drift': 2e-5, 'fathometer_pressure': 0.05,
+}  # fmt: skip
 """By recording, else by system: largest difference of any number, as a share of the largest
 magnitude in its column. Measured between Prescott and SkylakeX, with numpy's AVX2 and AVX-512
 loops off and on: bathymetry 2e-12 (a ship that moves; at rest 4e-16), diver 3e-13, obstacle 2e-9,
@@ -82,11 +77,9 @@ def track(bags, out, kernel_type, disabled=()):
         'PYTHONPATH': os.pathsep.join(filter(None, sys.path)),
     }
     done = subprocess.run(
-        [sys.executable, '-c', PROGRAM, str(out), *map(str, bags)],
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
+        [sys.executable, '-c', PROGRAM, str(out), *map(str, bags)], env=environment,
+        capture_output=True, text=True,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == kernel_type
     return [columns(out / str(number)) for number in range(len(bags))]

@@ -15,13 +15,13 @@ import re
 import shutil
 
 from helpers.clusters import small_cluster
+from helpers.commands import run
 import numpy as np
 import pytest
 
 from msg_adapters.soundings import write_soundings
 from sonar_imm.soundings import COLUMNS, Soundings
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.export.points import read_points, write_table
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 from sonar_imm_tools.survey import adjustment, jobs, resuming
@@ -32,25 +32,15 @@ pytest.importorskip('pyarrow')
 
 SMALL = ('lines=3', 'cross_lines=1', 'spacing=25', 'length=80', 'ping_interval=0.7', 'ghost=false')
 PRODUCTS = (
-    'survey.tif',
-    'provenance.parquet',
-    'coverage.geojson',
-    'adjustment.json',
-    'crossings.csv',
+    'survey.tif', 'provenance.parquet', 'coverage.geojson', 'adjustment.json', 'crossings.csv',
     'report.html',
-)
+)  # fmt: skip
 
 
 RECORD = {
-    'system': 'bathymetry',
-    'bag': 'a.bag',
-    'topics': {},
+    'system': 'bathymetry', 'bag': 'a.bag', 'topics': {},
     'parameters': BathymetryConfig().as_dict(),
-}
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
+}  # fmt: skip
 
 
 @pytest.fixture(scope='module')

@@ -92,13 +92,6 @@ def test_impossible_transitions_stay_impossible():
     np.testing.assert_allclose(P.sum(axis=-1), 1.0)
 
 
-def test_the_posterior_of_transitions_has_the_right_margins():
-    rng = np.random.default_rng(4)
-    after = simplex(rng, 5)
-    posterior = transition_posterior(PRIOR[None], simplex(rng, 5), after)
-    np.testing.assert_allclose(posterior.sum(axis=1), after, atol=1e-14)
-
-
 @pytest.mark.parametrize('shared', [False, True])
 @pytest.mark.parametrize('M, families', [(3, 1), (8, 1), (17, 1), (6, 3), (17, 4)])
 def test_what_is_learnt_is_what_the_plain_forms_say(M, families, shared):

@@ -17,7 +17,6 @@ import pytest
 from scipy.linalg import expm
 
 from sonar_imm.estimation import bank as verbs
-from sonar_imm.estimation import imm
 from sonar_imm.estimation.bank import Bank, Gaussians, Moves
 from sonar_imm.estimation.rows import Rows
 
@@ -144,30 +143,6 @@ def one_block(seed, N=4, n=3, m=5):
 
 def model_last(x, P):
     return Gaussians(np.moveaxis(x, 1, -1), np.moveaxis(P, 1, -1))
-
-
-@pytest.mark.parametrize('seed', range(4))
-def test_one_cycle_of_equal_models_is_the_readable_imm(seed):
-    x, P, mu, matrix, F, Q, B, rng = one_block(seed)
-    plain = Bank(np.zeros((2, x.shape[1])))
-    mixed = imm.mix(x, P, mu, matrix)
-    moved = imm.predict(mixed.x, mixed.P, F, Q, B)
-    z, R = rng.normal(size=(len(x), 2)), 0.4 * np.eye(2) + 0.1
-    H = np.broadcast_to(np.eye(2, x.shape[2]), (1, x.shape[1], 2, x.shape[2]))
-    due = imm.update(moved.x, moved.P, mixed.c, z[:, None] - moved.x[..., :2], H, R[None])
-
-    (block,), c = verbs.mix(plain, [model_last(x, P)], mu, matrix)
-    steps = Moves(np.moveaxis(F, 0, -1), np.moveaxis(Q, 0, -1), B.T)
-    block, row = verbs.predict(block, steps), np.arange(len(x))
-    pairs = verbs.weigh(block, row, z, np.tile(R, (len(x), 1, 1)))
-    likelihood = (c * np.exp(pairs.log)).sum(axis=1)
-    ratio = np.exp(pairs.log) / likelihood[:, None]
-    block, weight = verbs.update(block, pairs, row, ratio, np.zeros(len(x)))
-    right = model_last(due.x, due.P)
-    np.testing.assert_allclose(block.x, right.x, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(block.P, right.P, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(c * weight, due.mu, rtol=1e-10)
-    np.testing.assert_allclose(np.log(likelihood), due.log_likelihood, rtol=1e-10)
 
 
 @pytest.mark.parametrize('considered', [False, True])

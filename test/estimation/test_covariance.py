@@ -304,17 +304,15 @@ def test_roots_and_soundness_are_those_of_the_eigenvalues(n):
     S = np.moveaxis(P, 0, -1)
     L, sound = semidefinite_roots(S), are_sound(S)
     for k, each in enumerate(P):
-        finite = np.isfinite(each).all()
         own = np.diag(each)
         lonely = (each[own == 0.0] != 0.0).any()  # a covariance without a variance
-        least = least_eigenvalue(each) if finite and not lonely else -1.0
+        least = -1.0 if lonely or not np.isfinite(each).all() else least_eigenvalue(each)
         if (own < 0.0).any() or least < -ROUNDING:
             assert not sound[k], k
         elif not own.any() or least > LIMIT + ROUNDING:
             assert sound[k], k
         if sound[k]:
-            mine = np.tril(L[:, :, k])
-            size = np.sqrt(own)
+            mine, size = np.tril(L[:, :, k]), np.sqrt(own)
             assert (np.abs(mine @ mine.T - each) <= 1e-13 * np.outer(size, size)).all(), k
     assert {False, True} == set(sound.tolist())
 

@@ -259,17 +259,6 @@ def test_a_model_with_outputs_of_its_own_is_the_same_model():
     assert imm.model_probabilities[0] > 0.99
 
 
-def test_smoothing_is_nearer_to_the_truth():
-    z, truth = walk()
-    imm = IMM(MODELS, T, **START, measurement=position(1.0))
-    filtered = []
-    for each in z:
-        imm.step(each)
-        filtered.append(imm.estimate.mean)
-    error, smoothed = np.array(filtered) - truth, imm.smooth().mean - truth
-    assert np.sqrt(np.mean(smoothed**2)) < 0.75 * np.sqrt(np.mean(error**2))
-
-
 def test_constant_acceleration_composes():
     F1, Q1, _ = ca(noise=0.1).motion(np.zeros(6), 0.4)
     F2, Q2, _ = ca(noise=0.1).motion(np.zeros(6), 0.8)

@@ -63,13 +63,6 @@ def test_the_sums_over_events_are_those_of_the_prototype(case, form):
     np.testing.assert_allclose(after, VECTORS[f'{case}/out_existence'], rtol=1e-10)
 
 
-@pytest.mark.parametrize('case', CASES)
-def test_the_events_are_those_of_the_prototype(case):
-    possible = VECTORS[f'{case}/ratio'] > 0.0
-    events = oracle.events(possible)
-    assert np.array_equal(np.reshape(events, (-1, len(possible))), VECTORS[f'{case}/out_events'])
-
-
 @settings(deadline=None, max_examples=60)
 @given(st.integers(0, 2**32 - 1))
 def test_both_forms_agree_with_brute_force_over_existence_and_pairings(seed):

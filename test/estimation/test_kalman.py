@@ -26,99 +26,58 @@ def rng():
 
 
 def test_predict_moves_mean_and_spreads_covariance(rng):
-    x, P, F, Q, b = (
-        rng.normal(size=3),
-        random_covariance(rng, 3),
-        rng.normal(size=(3, 3)),
-        random_covariance(rng, 3),
-        np.ones(3),
-    )
+    x, F, b = rng.normal(size=3), rng.normal(size=(3, 3)), np.ones(3)
+    P, Q = random_covariance(rng, 3), random_covariance(rng, 3)
     moved, spread, _ = predict(x, P, F, Q, b)
-    np.testing.assert_allclose(
-        moved, [sum(F[i, j] * x[j] for j in range(3)) + 1.0 for i in range(3)], rtol=1e-14
-    )
+    expected = [sum(F[i, j] * x[j] for j in range(3)) + 1.0 for i in range(3)]
+    np.testing.assert_allclose(moved, expected, rtol=1e-14)
     np.testing.assert_allclose(spread, np.linalg.multi_dot([F, P, F.T]) + Q, rtol=1e-13)
     np.testing.assert_array_equal(spread, spread.T)
 
 
-def test_update_equals_information_form(rng):
+def test_update_equals_information_form_and_the_density_of_its_innovation(rng):
     x, P, H = rng.normal(size=4), random_covariance(rng, 4), rng.normal(size=(2, 4))
     R, z = random_covariance(rng, 2), rng.normal(size=2)
-    updated = update(x, P, z - H @ x, H, R)
+    nu, S = z - H @ x, H @ P @ H.T + R
+    updated = update(x, P, nu, H, R)
     information = np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H
     np.testing.assert_allclose(updated.P, np.linalg.inv(information), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(
-        information @ updated.x, np.linalg.inv(P) @ x + H.T @ np.linalg.inv(R) @ z, rtol=1e-9
-    )
-
-
-def test_update_reports_the_density_of_the_innovation(rng):
-    P, H, R, nu = (
-        random_covariance(rng, 3),
-        rng.normal(size=(2, 3)),
-        random_covariance(rng, 2),
-        rng.normal(size=2),
-    )
-    updated = update(np.zeros(3), P, nu, H, R)
-    S = H @ P @ H.T + R
+    due = np.linalg.inv(P) @ x + H.T @ np.linalg.inv(R) @ z
+    np.testing.assert_allclose(information @ updated.x, due, rtol=1e-9)
     np.testing.assert_allclose(updated.innovation_covariance, S, rtol=1e-13)
-    np.testing.assert_allclose(
-        updated.log_likelihood, multivariate_normal(cov=S).logpdf(nu), rtol=1e-12
-    )
+    density = multivariate_normal(cov=S).logpdf(nu)
+    np.testing.assert_allclose(updated.log_likelihood, density, rtol=1e-12)
     np.testing.assert_allclose(updated.nis, nu @ np.linalg.inv(S) @ nu, rtol=1e-11)
 
 
 def test_a_batch_is_its_members(rng):
     x, P = rng.normal(size=(5, 3, 4)), random_covariance(rng, 5, 3, 4)
-    F, Q, H, R = (
-        rng.normal(size=(3, 4, 4)),
-        random_covariance(rng, 3, 4),
-        rng.normal(size=(2, 4)),
-        random_covariance(rng, 5, 1, 2),
-    )
-    nu = rng.normal(size=(5, 3, 2))
+    F, Q, H = rng.normal(size=(3, 4, 4)), random_covariance(rng, 3, 4), rng.normal(size=(2, 4))
+    R, nu = random_covariance(rng, 5, 1, 2), rng.normal(size=(5, 3, 2))
     px, pP, _ = predict(x, P, F, Q)
     updated = update(px, pP, nu, H, R)
-    for t in range(5):
-        for m in range(3):
-            alone = update(*predict(x[t, m], P[t, m], F[m], Q[m])[:2], nu[t, m], H, R[t, 0])
-            for whole, single in zip(updated, alone):
-                np.testing.assert_allclose(whole[t, m], single, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize('batch', [(5,), (5, 3)])
-def test_one_state_against_many_measurement_noises(rng, batch):
-    x, P, H, nu = rng.normal(size=3), random_covariance(rng, 3), np.eye(2, 3), rng.normal(size=2)
-    R = random_covariance(rng, *batch, 2)
-    whole = update(x, P, nu, H, R)
-    for i in np.ndindex(batch):
-        for part, single in zip(whole, update(x, P, nu, H, R[i])):
-            np.testing.assert_allclose(part[i], single, rtol=1e-9, atol=1e-12)
+    for t, m in np.ndindex(5, 3):
+        alone = update(*predict(x[t, m], P[t, m], F[m], Q[m])[:2], nu[t, m], H, R[t, 0])
+        for whole, single in zip(updated, alone):
+            np.testing.assert_allclose(whole[t, m], single, rtol=1e-9, atol=1e-12)
 
 
 def test_a_perfect_measurement_is_allowed():
-    updated = update(
-        np.zeros(2), np.eye(2), np.array([3.0]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
-    )
+    H = np.array([[1.0, 0.0]])
+    updated = update(np.zeros(2), np.eye(2), np.array([3.0]), H, np.zeros((1, 1)))
     np.testing.assert_allclose(updated.x, [3.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(updated.P, [[0.0, 0.0], [0.0, 1.0]], atol=1e-12)
     assert updated.P[0, 0] > 0.0 and updated.repaired
 
 
-def test_a_singular_innovation_covariance_is_named():
-    P = np.stack([np.eye(2), np.zeros((2, 2)), np.eye(2)])
-    with pytest.raises(
-        CovarianceError, match='1 of 3: innovation covariance is not positive definite'
-    ) as caught:
-        update(np.zeros((3, 2)), P, np.zeros((3, 1)), np.array([[1.0, 0.0]]), np.zeros((1, 1)))
+def test_a_covariance_that_is_singular_or_nan_is_named():
+    P, H = np.stack([np.eye(2), np.zeros((2, 2)), np.eye(2)]), np.array([[1.0, 0.0]])
+    sentence = '1 of 3: innovation covariance is not positive definite'
+    with pytest.raises(CovarianceError, match=sentence) as caught:
+        update(np.zeros((3, 2)), P, np.zeros((3, 1)), H, np.zeros((1, 1)))
     np.testing.assert_array_equal(caught.value.where, [False, True, False])
-
-
-def test_nan_is_named_before_it_spreads():
     with pytest.raises(CovarianceError, match='innovation covariance is not finite'):
-        update(
-            np.zeros(2), np.full((2, 2), np.nan), np.zeros(1), np.array([[1.0, 0.0]]), np.eye(1)
-        )
+        update(np.zeros(2), np.full((2, 2), np.nan), np.zeros(1), H, np.eye(1))
 
 
 @pytest.mark.parametrize('unit', [1e-20, 1.0, 1e20])

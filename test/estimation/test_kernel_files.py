@@ -22,18 +22,6 @@ import pytest
 import sonar_imm
 
 PACKAGE = Path(sonar_imm.__file__).parent
-FILES = (
-    'acoustics/ray_kernels.py',
-    'acoustics/wave_kernels.py',
-    'estimation/onset_kernels.py',
-    'estimation/set_kernels.py',
-    'estimation/set_shift_kernels.py',
-    'trackers/bathymetry/filter_kernels.py',
-    'trackers/bathymetry/surface_kernels.py',
-    'trackers/bathymetry/terrain_kernels.py',
-)
-"""One kernel for each verb."""
-ALONE = (*FILES, 'trackers/bathymetry/grid_kernels.py')
 TYPES = {'BoolArray', 'ComplexArray', 'FloatArray', 'IndexArray', 'IntArray'}
 ALLOWED = {
     'numpy': {'np'},
@@ -64,10 +52,13 @@ def kernels_of(tree):
     return {function.name for function in decorated}
 
 
-def test_every_kernel_file_is_known():
-    files = {path.relative_to(PACKAGE).as_posix(): path for path in PACKAGE.rglob('*.py')}
-    found = {name for name, path in files.items() if kernels_of(ast.parse(path.read_text()))}
-    assert found == {*ALONE}
+ALONE = sorted(
+    path.relative_to(PACKAGE).as_posix()
+    for path in PACKAGE.rglob('*.py')
+    if kernels_of(ast.parse(path.read_text()))
+)
+FILES = [name for name in ALONE if not name.endswith('/grid_kernels.py')]
+"""One kernel for each verb."""
 
 
 @pytest.mark.parametrize('name', ALONE)

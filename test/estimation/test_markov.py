@@ -11,7 +11,6 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
-from oracles.markov import stationary_law
 import pytest
 from scipy.linalg import expm
 from scipy.stats import poisson
@@ -40,21 +39,6 @@ def test_what_is_no_transition_matrix_is_refused(bad):
 def test_a_bad_row_is_named():
     with pytest.raises(ValueError, match='row 1 .* sums to 1.1'):
         markov.check_transition_matrix([[0.9, 0.1], [0.5, 0.6]])
-
-
-def test_stationary_law_of_an_asymmetric_chain():
-    # (.8, .2) by hand: .1 * .8 = .4 * .2
-    np.testing.assert_allclose(
-        stationary_law(np.array([[0.9, 0.1], [0.4, 0.6]])), [0.8, 0.2], atol=1e-14
-    )
-    law = stationary_law(ASYMMETRIC)
-    np.testing.assert_allclose(law @ ASYMMETRIC, law, atol=1e-14)
-    np.testing.assert_allclose(law, np.linalg.matrix_power(ASYMMETRIC, 400)[0], atol=1e-12)
-
-
-def test_a_chain_in_two_pieces_has_no_single_law():
-    with pytest.raises(ValueError, match='several distributions'):
-        stationary_law(np.eye(2))
 
 
 def test_ten_small_steps_are_one_large_step():
@@ -139,13 +123,6 @@ def test_a_step_back_in_time_is_refused():
         markov.RateChain(ASYMMETRIC, 1.0).transition(-0.1)
     with pytest.raises(ValueError, match='finite'):
         markov.RateChain(ASYMMETRIC, 1.0).transition(np.inf)
-
-
-def test_the_cache_of_steps_is_bounded():
-    chain = markov.RateChain(ASYMMETRIC, 1.0)
-    for k in range(3 * markov._CACHED_STEPS):
-        chain.transition(1.0 + 1e-3 * k)
-    assert len(chain._cache) <= markov._CACHED_STEPS
 
 
 def test_persistent_headings_match_the_reference(diver_reference):

@@ -16,7 +16,7 @@ import sys
 import numpy as np
 import pytest
 
-from sonar_imm import ct, cv, IMM, ParticleIMM, position
+from sonar_imm import ParticleIMM
 from sonar_imm.estimation import kalman
 from sonar_imm.estimation.markov import RateChain
 
@@ -214,56 +214,6 @@ def test_two_models_are_the_tree_of_all_sequences(order):
     assert not close(runs, tree(TWO.T, Z), bias=0.002)
 
 
-def test_mixing_of_particles_is_nearer_to_the_tree_than_mixing_of_moments():
-    """The Gaussian filter of the same models is off by more than the particles scatter."""
-    exact = tree(TWO, Z)[0]
-    x, P, mu = np.zeros(2), np.ones(2), np.full(2, 0.5)
-    q, drift = np.array(MODES).T
-    for z in Z:
-        c = mu @ TWO
-        W = TWO * mu[:, None] / c
-        mean = W.T @ x
-        P = (W * (P[:, None] + (x[:, None] - mean) ** 2)).sum(axis=0) + q
-        x, S = mean + drift, P + 0.25
-        mu = c * np.exp(-0.5 * (z - x) ** 2 / S) / np.sqrt(S)
-        mu, x, P = mu / mu.sum(), x + P / S * (z - x), P * 0.25 / S
-    runs = [particle_run(seed, count=20_000)[0] for seed in range(4)]
-    assert np.abs(np.mean(runs) - exact) < 0.5 * abs(mu[0] - exact)
-
-
-def test_many_models_agree_with_the_gaussian_filter_where_nothing_switches():
-    """Constant velocities that never change: both filters are exact."""
-    rng, models = np.random.default_rng(9), [cv(0.05, name='calm'), cv(0.4, name='lively')]
-    P0 = np.diag([1.0, 1.0, 0.25, 0.25])
-    gaussian = IMM(models, np.eye(2), np.zeros(4), P0, position(0.5))
-
-    def moves(model):
-        F, Q, _ = model.motion(np.zeros(4), 1.0)
-        return lambda x, rng, dt: x @ F.T + rng.multivariate_normal(np.zeros(4), Q, len(x))
-
-    def fix(x, z):
-        return -0.5 * (((z - x[:, :2]) / 0.5) ** 2).sum(axis=1)
-
-    particles = ParticleIMM(
-        {model.name: moves(model) for model in models},
-        np.eye(2),
-        rng.multivariate_normal(np.zeros(4), P0, 20_000),
-        fix,
-        rng,
-    )
-    for k in range(6):
-        z = [0.4 * k, 0.1 * k]
-        gaussian.step(z)
-        particles.step(z)
-    np.testing.assert_allclose(
-        particles.model_probabilities, gaussian.model_probabilities, atol=0.02
-    )
-    np.testing.assert_allclose(particles.estimate.mean, gaussian.estimate.mean, atol=0.03)
-    np.testing.assert_allclose(
-        particles.estimate.covariance, gaussian.estimate.covariance, atol=0.03
-    )
-
-
 # -- resampling, recovery, time -------------------------------------------------------------------
 
 
@@ -450,19 +400,6 @@ def test_steps_to_stamps_are_steps_of_their_differences():
     none = filter_(stamp=50.0)
     none.step(0.2, 0.0)
     assert first.particles.tobytes() == none.particles.tobytes() and first.stamp == 50.0
-
-
-def test_both_filters_have_the_same_verbs():
-    models, start = [cv(noise=0.1), ct(noise=0.1, turn_rate=0.2)], np.zeros(4)
-    gaussian = IMM(models, TWO, start, np.eye(4), position(std=1.0))
-    particles = ParticleIMM(
-        {'a': still, 'b': still}, TWO, np.zeros((9, 1)), normal(1.0), np.random.default_rng(1)
-    )
-    verbs = ('step', 'estimate', 'model_probabilities', 'log_likelihood', 'stamp', 'names')
-    for each in (gaussian, particles):
-        assert all(hasattr(each, verb) for verb in verbs)
-    assert gaussian.step(None) == particles.step(None) == 'used'
-    assert gaussian.stamp == particles.stamp == 1.0
 
 
 def test_the_package_shows_its_names_before_they_are_imported():

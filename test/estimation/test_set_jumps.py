@@ -81,14 +81,6 @@ def test_sets_that_jump_are_the_exact_ones(model, records, change):
         assert wanted.jump[JUMP_AT, 0] > 0.5 > wanted.jump[[1, 2, 4, 5, 6], 0].max()
 
 
-def test_without_jumps_the_exact_ones_differ(model, records):
-    """What is compared depends on jumps."""
-    with_jumps, without = exact(model, records), exact(evolve(model, jump=None), records)
-    assert 0.5 * np.abs(with_jumps.pmf - without.pmf).sum(axis=1).max() > 0.1
-    assert with_jumps.log_evidence.sum() > without.log_evidence.sum() + 1.0
-    assert not without.jump.any()
-
-
 def test_what_a_jump_is_beforehand():
     jump = Jump(probability=0.1, std=3.0, step=2, reach=6)
     tables, places = jump.tables(), np.arange(-12, 13, 2)

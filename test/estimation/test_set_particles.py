@@ -89,42 +89,6 @@ def test_proposals_change_how_many_particles_count_and_nothing_else(model, exact
         assert abs(evidence - EXACT_LOG_EVIDENCE) < 0.7
 
 
-@pytest.mark.parametrize('table', ['walk_ratio', 'birth_ratio'])
-def test_without_its_ratio_a_proposal_is_wrong(model, exact, table, monkeypatch):
-    from sonar_imm.estimation import set_filter
-
-    if table == 'walk_ratio':
-        fill = set_filter.fill_walks
-
-        def unpaid(walks, g, share, wanted, tables, **options):
-            fill(walks, g, share, wanted, tables, **options)
-            tables.ratio[tables.ratio > 0.0] = 1.0
-
-        monkeypatch.setattr(set_filter, 'fill_walks', unpaid)
-    else:
-        births = set_filter.propose_births
-        nothing = np.zeros((1, model.cells))
-        monkeypatch.setattr(
-            set_filter, 'propose_births', lambda *a: births(*a)._replace(ratio=nothing)
-        )
-    assert variation(run(model, exact['B'], 5000, seed=1)[0], exact) > 0.03
-
-
-def test_amplitudes_that_are_not_drawn_anew_at_random_are_paid_for(model, exact):
-    """Best amplitudes without a penalty make too many members; with the paper's, too few."""
-    orders = np.arange(1, 4)
-    mean = {
-        name: (run(changed, exact['B'], 3000, seed=1)[0] @ orders).mean()
-        for name, changed in {
-            'exact': model,
-            'free': evolve(model, amplitude_prior='bic_half', independent_samples=1.0),
-            'paper': evolve(model, amplitude_prior='paper', independent_samples=500.0),
-        }.items()
-    }
-    assert mean['free'] > mean['exact'] + 0.3
-    assert mean['paper'] < mean['exact'] - 0.1
-
-
 def test_threads_do_not_change_a_byte(model, exact):
     single, four = (run(model, exact['B'][:10], 3001, seed=5, threads=n) for n in (1, 4))
     assert single[0].tobytes() == four[0].tobytes()

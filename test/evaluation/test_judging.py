@@ -30,21 +30,17 @@ def folder_of(tmp_path, estimates=(), **run):
     folder.write_json(
         'run.json',
         {
-            'system': 'diver',
-            'bag': str(tmp_path / 'dive'),
-            'counts': {},
-            'topics': {'/fix': 'fix'},
-            'parameters': {},
-            **run,
+            'system': 'diver', 'bag': str(tmp_path / 'dive'), 'counts': {},
+            'topics': {'/fix': 'fix'}, 'parameters': {}, **run,
         },
-    )
+    )  # fmt: skip
     return folder
 
 
 @pytest.mark.parametrize('system', SYSTEMS)
 def test_every_system_has_a_judge_with_a_limit(system):
     module = import_module(SYSTEMS[system].judge)
-    assert callable(module.judge) and isinstance(module.LIMIT, Limit)
+    assert callable(module.scored) and isinstance(module.LIMIT, Limit)
 
 
 def test_a_limit_is_met_or_missed():
@@ -112,4 +108,4 @@ def test_truth_that_is_none_is_refused_by_the_name_of_its_recording(system, tmp_
     nothing = Estimate.from_columns(place, stamp_ns=1, frame_id='map')
     monkeypatch.setattr(module, 'read_truth', lambda *_: [nothing])
     with pytest.raises(BagError, match=re.escape(f'{tmp_path / "dive"}: ')):
-        module.judge(folder_of(tmp_path), JudgeOptions())
+        judge(folder_of(tmp_path, system=system))

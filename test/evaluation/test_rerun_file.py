@@ -40,16 +40,10 @@ def drawn(monkeypatch):
 def estimate(state_names, covariance, **extras):
     n, d = covariance.shape[:2]
     return Estimate(
-        stamp_ns=1,
-        frame_id='map',
-        xyz=np.zeros((n, 3), np.float32),
-        state_names=state_names,
-        state=np.zeros((n, d)),
-        covariance=covariance,
-        model_names=(),
-        probabilities=np.empty((n, 0)),
-        extras=extras,
-    )
+        stamp_ns=1, frame_id='map', xyz=np.zeros((n, 3), np.float32), state_names=state_names,
+        state=np.zeros((n, d)), covariance=covariance, model_names=(),
+        probabilities=np.empty((n, 0)), extras=extras,
+    )  # fmt: skip
 
 
 def test_ellipsoids_are_those_of_the_covariances_of_places(drawn):
@@ -126,16 +120,14 @@ def scan(stamp_ns, ids, states):
     n = len(ids)
     return evolve(
         estimate(
-            ('px', 'py'),
-            np.tile(np.diag([4.0, 9.0]), (n, 1, 1)),
-            track_id=np.array(ids, np.uint32),
-            track_state=np.array(states, np.uint8),
+            ('px', 'py'), np.tile(np.diag([4.0, 9.0]), (n, 1, 1)),
+            track_id=np.array(ids, np.uint32), track_state=np.array(states, np.uint8),
         ),
         stamp_ns=stamp_ns,
         state=np.tile([10.0, np.nan], (n, 1)),
         model_names=('still', 'east'),
         probabilities=np.tile([0.25, 0.75], (n, 1)),
-    )
+    )  # fmt: skip
 
 
 def test_tracks_that_were_ever_confirmed_have_curves_of_what_is_known(written):
@@ -149,12 +141,9 @@ def test_tracks_that_were_ever_confirmed_have_curves_of_what_is_known(written):
     }  # fmt: skip
     first = {path: what.arguments for path, stamp, what in curves if stamp == 5}
     assert {path: value for path, (value,) in first.items() if 'track_7' in path} == {
-        'diver/track_7/state/px': 10.0,
-        'diver/track_7/std/px': 2.0,
-        'diver/track_7/std/py': 3.0,
-        'diver/track_7/probability/still': 0.25,
-        'diver/track_7/probability/east': 0.75,
-    }
+        'diver/track_7/state/px': 10.0, 'diver/track_7/std/px': 2.0, 'diver/track_7/std/py': 3.0,
+        'diver/track_7/probability/still': 0.25, 'diver/track_7/probability/east': 0.75,
+    }  # fmt: skip
     places = [(stamp, len(what.arguments[0])) for path, stamp, what in stream.logged
               if path == 'diver/points']  # fmt: skip
     assert places == [(5, 3), (6, 2), (7, 2)]

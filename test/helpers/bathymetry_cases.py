@@ -27,16 +27,12 @@ def vector(name):
     with np.load(VECTORS / f'{name}.npz') as archive:
         case = dict(archive)
     values = {
-        'sonar_height': float(case['H']),
-        'tilt_deg': math.degrees(case['tilt']),
+        'sonar_height': float(case['H']), 'tilt_deg': math.degrees(case['tilt']),
         'element_spacing_wavelengths': float(case['dlam']),
         'transition_matrix': case['Pi'].ravel().tolist(),
-        'initial_probabilities': case['mu0'].tolist(),
-        'initial_std': float(case['sd0']),
-        'particles_per_model': 3000,
-        'shadow_gate': False,
-        **EXACT,
-    }
+        'initial_probabilities': case['mu0'].tolist(), 'initial_std': float(case['sd0']),
+        'particles_per_model': 3000, 'gate_false_alarm': 1.0, **EXACT,
+    }  # fmt: skip
     if name.startswith('set_ii_'):
         values |= {'model_set': 'height_two_rw', 'sigmas': case['sigmas'].tolist()}
     elif name.startswith('set_iii'):
@@ -52,12 +48,9 @@ def vector(name):
         }
     noise = np.full(len(case['r']), float(case['sn2']))
     snapshot = Snapshot(
-        stamp_ns=1_000,
-        range=case['r'],
-        iq=case['Y'],
-        noise_variance=noise,
+        stamp_ns=1_000, range=case['r'], iq=case['Y'], noise_variance=noise,
         signal_variance=case['rho'] * noise,
-    )
+    )  # fmt: skip
     return case, BathymetryConfig(**values), snapshot
 
 

@@ -11,7 +11,7 @@
 from attrs import fields
 import numpy as np
 
-from sonar_imm.measurements import Fix
+from sonar_imm.measurements import Arrivals, Fix, Fixes
 
 SECOND = 10**9
 
@@ -23,6 +23,29 @@ def fix(second, x, y, covariance=None, frame_id='map'):
         covariance=np.eye(2) if covariance is None else covariance,
         frame_id=frame_id,
     )
+
+
+def scan_of(second, places, std=0.5, **more):
+    """Fixes at places (n, 2), each good to `std` m."""
+    n = len(places)
+    return Fixes(
+        stamp_ns=round(second * SECOND),
+        position=np.column_stack([np.reshape(places, (n, 2)), np.zeros(n)]),
+        covariance=np.tile(std**2 * np.eye(2), (n, 1, 1)),
+        **{'frame_id': 'map', **more},
+    )
+
+
+def arrivals(stamp_ns, rx, toa, **more):
+    """Times toa (n,) heard at receivers rx (n, 3), of one tag unless `tx` (3,) or (n, 3) says
+    where the transmitter is; good to a tenth of a millisecond, and without bearings."""
+    n = len(rx)
+    known = {'tx_id': np.zeros(n), 'rx_id': np.arange(n), 'tx': np.nan, 'var_toa': 1e-8}
+    known |= {'bearing': np.nan, 'var_bearing': np.nan, 'frame_id': 'map', **more}
+    known['tx'] = np.broadcast_to(known['tx'], (n, 3))
+    for name in ('var_toa', 'bearing', 'var_bearing'):
+        known[name] = np.broadcast_to(known[name], n)
+    return Arrivals(stamp_ns=stamp_ns, rx=rx, toa=toa, **known)
 
 
 def run(tracker, measurements):

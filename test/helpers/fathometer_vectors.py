@@ -40,14 +40,10 @@ def exact_hmm_model() -> SetModel:
     """The model that the records of exact_hmm.npz are drawn from."""
     lag = np.arange(60)
     return SetModel(
-        cells=60,
-        separation=3,
-        order_min=1,
-        transition=np.full((3, 3), 0.2) + 0.4 * np.eye(3),
-        walk=gaussian_walk(0.8),
-        gram=np.sinc(lag / 2.2) * np.exp(-((lag / 12.0) ** 2)),
+        cells=60, separation=3, order_min=1, transition=np.full((3, 3), 0.2) + 0.4 * np.eye(3),
+        walk=gaussian_walk(0.8), gram=np.sinc(lag / 2.2) * np.exp(-((lag / 12.0) ** 2)),
         amplitude_std=3.0,
-    )
+    )  # fmt: skip
 
 
 class SignedSet(NamedTuple):
@@ -70,15 +66,10 @@ def signed_sets(folder: Path) -> Iterator[SignedSet]:
     pulse = band_pulse(*edges, float(v['sound_speed']))
     for k, order in enumerate(v['order']):
         model = SetModel(
-            cells=n,
-            separation=1,
-            order_min=int(order),
-            transition=np.eye(1),
-            walk=np.ones(1),
+            cells=n, separation=1, order_min=int(order), transition=np.eye(1), walk=np.ones(1),
             gram=pulse(float(v['depth_step']) * np.arange(n)),
-            amplitude_std=float(v['amplitude_std_sigmas']),
-            negative_probability=0.05,
-        )
+            amplitude_std=float(v['amplitude_std_sigmas']), negative_probability=0.05,
+        )  # fmt: skip
         sets = Sets.empty(model, 1)
         sets.order[0], sets.cell[0] = order, v['cell'][k, :order]
         sets.sign[0] = v['sign'][k, :order]
@@ -103,13 +94,9 @@ def pressure(folder: Path) -> dict[str, float]:
     names = ('snapshot_seconds', 'record_seconds', 'frequency_min', 'frequency_max')
     settings: dict[str, Any] = {name: float(v[name]) for name in names}
     config = FathometerConfig(
-        phones=16,
-        element_spacing=float(v['element_spacing']),
-        phone_correction='off',
-        noise_depth_min=0.0,
-        noise_depth_max=0.0,
-        **settings,
-    )
+        phones=16, element_spacing=float(v['element_spacing']), phone_correction='off',
+        noise_depth_min=0.0, noise_depth_max=0.0, **settings,
+    )  # fmt: skip
     depth = v['depth']
     lattice = Lattice(float(depth[0]), float(depth[1] - depth[0]), len(depth))
     worst: dict[str, float] = {}

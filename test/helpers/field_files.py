@@ -225,18 +225,13 @@ def segy(path, spots):
             latitude, longitude = each.degrees
             file.trace[k] = rows[k].astype(np.float32)
             file.header[k] = {
-                field.TRACE_SAMPLE_INTERVAL: 266,
-                field.TRACE_SAMPLE_COUNT: rows.shape[1],
-                field.YearDataRecorded: moment.year,
-                field.DayOfYear: moment.timetuple().tm_yday,
-                field.HourOfDay: moment.hour,
-                field.MinuteOfHour: moment.minute,
-                field.SecondOfMinute: moment.second,
-                field.SourceGroupScalar: -1000,
-                field.CoordinateUnits: 2,
-                field.SourceX: round(3.6e6 * longitude),
+                field.TRACE_SAMPLE_INTERVAL: 266, field.TRACE_SAMPLE_COUNT: rows.shape[1],
+                field.YearDataRecorded: moment.year, field.DayOfYear: moment.timetuple().tm_yday,
+                field.HourOfDay: moment.hour, field.MinuteOfHour: moment.minute,
+                field.SecondOfMinute: moment.second, field.SourceGroupScalar: -1000,
+                field.CoordinateUnits: 2, field.SourceX: round(3.6e6 * longitude),
                 field.SourceY: round(3.6e6 * latitude),
-            }
+            }  # fmt: skip
 
 
 def traces_csv(path, spots):
@@ -340,13 +335,10 @@ def phases_bag(path, spots):
             tx_angles=marine.floats([]),
             rx_angles=marine.floats([]),
             image=marine.make(
-                'SonarImageData',
-                is_bigendian=False,
-                dtype=8,
-                beam_count=1,
+                'SonarImageData', is_bigendian=False, dtype=8, beam_count=1,
                 data=np.frombuffer(row.tobytes(), np.uint8),
             ),
-        )
+        )  # fmt: skip
 
     def messages(each, stamp):
         ping = iq[next(count), 140:]
@@ -449,20 +441,12 @@ FORMATS = [
     ),
     Format('AIS: messages 1, 2, 3, 18, 19, 27', 'harbour.nmea', ais, 'diver'),
     Format(
-        'receivers of telemetry: rows of receiver, tag, time',
-        'vue.csv',
-        telemetry,
-        'diver',
-        ('--receivers', '{}/stations.csv', '--toa-std', '0.001'),
-        step=5.0,
+        'receivers of telemetry: rows of receiver, tag, time', 'vue.csv', telemetry, 'diver',
+        ('--receivers', '{}/stations.csv', '--toa-std', '0.001'), step=5.0,
     ),
     Format(
-        'CSV of arrival times',
-        'arrivals.csv',
-        arrivals,
-        'diver',
-        ('--receivers', '{}/stations.csv', '--toa-std', '0.001'),
-        step=5.0,
+        'CSV of arrival times', 'arrivals.csv', arrivals, 'diver',
+        ('--receivers', '{}/stations.csv', '--toa-std', '0.001'), step=5.0,
     ),
     Format('WAV, FLAC of an array', 'array_20240531_100000.wav', sound, 'fathometer'),
     Format('SEG-Y', 'line.seg', segy, 'fathometer'),
@@ -482,11 +466,7 @@ FORMATS = [
     Format('XTF: side scan, processed soundings', 'line.xtf', side_scan_xtf, 'obstacle', step=0.2),
     Format('XTF: side scan, processed soundings', 'swath.xtf', soundings_xtf, '', step=0.2),
     Format(
-        'folder of PNG, JPEG with a CSV of stamps',
-        'frames',
-        pictures,
-        'obstacle',
-        ('--far-range', '40', '--fov', '60'),
-        step=0.2,
+        'folder of PNG, JPEG with a CSV of stamps', 'frames', pictures, 'obstacle',
+        ('--far-range', '40', '--fov', '60'), step=0.2,
     ),
-]
+]  # fmt: skip

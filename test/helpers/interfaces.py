@@ -31,18 +31,10 @@ import sys
 PREFIX = Path(os.environ.get('SONAR_IMM_ROSIDL') or sys.prefix)
 """Where the generators are."""
 ORDER = (
-    'geographic_msgs',
-    'marine_interfaces',
-    'vision_msgs',
-    'seatrac_interfaces',
-    'acomms_msgs',
-    'stonefish_ros2',
-    'marine_acoustic_msgs',
-    'oculus_interfaces',
-    'ping360_sonar_msgs',
-    'sensors',
-    'dave_interfaces',
-)
+    'geographic_msgs', 'marine_interfaces', 'vision_msgs', 'seatrac_interfaces', 'acomms_msgs',
+    'stonefish_ros2', 'marine_acoustic_msgs', 'oculus_interfaces', 'ping360_sonar_msgs',
+    'sensors', 'dave_interfaces',
+)  # fmt: skip
 USES = ('builtin_interfaces', 'std_msgs', 'geometry_msgs')
 PACKAGE = """<?xml version="1.0"?>
 <package format="3">

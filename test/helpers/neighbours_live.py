@@ -68,14 +68,10 @@ def pose_with_covariance(step):
 def modem(step):
     east, north, up = place(step)
     return make(
-        'seatrac_interfaces/msg/ModemRec',
-        header=header(step),
-        src_id=3,
-        includes_position=True,
-        position_easting=round(10.0 * east),
-        position_northing=round(10.0 * north),
+        'seatrac_interfaces/msg/ModemRec', header=header(step), src_id=3, includes_position=True,
+        position_easting=round(10.0 * east), position_northing=round(10.0 * north),
         position_depth=round(-10.0 * up),
-    )
+    )  # fmt: skip
 
 
 def usbl(step):
@@ -127,39 +123,24 @@ def samples():
 
 def projected(step):
     return make(
-        MARINE + 'ProjectedSonarImage',
-        header=header(step),
-        ping_info=ping_info(),
-        beam_directions=vectors(BEARINGS),
-        ranges=1.0 + 0.5 * np.arange(60),
-        image=samples(),
-    )
+        MARINE + 'ProjectedSonarImage', header=header(step), ping_info=ping_info(),
+        beam_directions=vectors(BEARINGS), ranges=1.0 + 0.5 * np.arange(60), image=samples(),
+    )  # fmt: skip
 
 
 def raw(step):
     return make(
-        MARINE + 'RawSonarImage',
-        header=header(step),
-        ping_info=ping_info(),
-        sample_rate=1500.0,
-        samples_per_beam=60,
-        rx_angles=BEARINGS,
-        image=samples(),
-    )
+        MARINE + 'RawSonarImage', header=header(step), ping_info=ping_info(), sample_rate=1500.0,
+        samples_per_beam=60, rx_angles=BEARINGS, image=samples(),
+    )  # fmt: skip
 
 
 def oculus(step):
     return make(
-        'oculus_interfaces/msg/Ping',
-        header=header(step),
-        range_resolution=0.5,
-        n_ranges=60,
-        n_beams=9,
-        step=9,
-        sample_size=1,
-        bearings=np.linspace(-2000, 2000, 9).astype(np.int16),
+        'oculus_interfaces/msg/Ping', header=header(step), range_resolution=0.5, n_ranges=60,
+        n_beams=9, step=9, sample_size=1, bearings=np.linspace(-2000, 2000, 9).astype(np.int16),
         ping_data=SAMPLES.tobytes(),
-    )
+    )  # fmt: skip
 
 
 def ping360(step):
@@ -181,33 +162,23 @@ def sonoptix(step):
 
 def sonar_info(step):
     return make(
-        'marine_interfaces/msg/SonarInfo',
-        header=header(step),
-        intensity_quantity=3,
-        intensity_scale=1,
-        pulse_lengths=[4e-4],
-        tx_signal_types=[1],
-    )
+        'marine_interfaces/msg/SonarInfo', header=header(step), intensity_quantity=3,
+        intensity_scale=1, pulse_lengths=[4e-4], tx_signal_types=[1],
+    )  # fmt: skip
 
 
 def sonar_detections(step):
     return make(
-        MARINE + 'SonarDetections',
-        header=header(step),
-        ping_info=ping_info(),
-        two_way_travel_times=[0.04],
-        rx_angles=[0.1],
-    )
+        MARINE + 'SonarDetections', header=header(step), ping_info=ping_info(),
+        two_way_travel_times=[0.04], rx_angles=[0.1],
+    )  # fmt: skip
 
 
 def sonar_ranges(step):
     return make(
-        MARINE + 'SonarRanges',
-        header=header(step),
-        ping_info=ping_info(),
-        beam_unit_vec=vectors([0.1]),
-        ranges=[30.0],
-    )
+        MARINE + 'SonarRanges', header=header(step), ping_info=ping_info(),
+        beam_unit_vec=vectors([0.1]), ranges=[30.0],
+    )  # fmt: skip
 
 
 def dvl(type_name, step):

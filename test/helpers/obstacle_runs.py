@@ -29,17 +29,10 @@ FIXED = {'behaviours': ('fixed',), **EXACT}
 AS_STATED = {'variance_scale_min': 1.0, 'variance_scale_max': 1.0}
 """Variances as detections state them: what is wrong shows in the innovations."""
 FAITHFUL = {
-    **FIXED,
-    **AS_STATED,
-    'components': 41,
-    'max_offset': 12.0,
-    'scale_std': 0.0,
-    'navigation_noise': (0.0, 0.0, 0.0),
-    'clutter_density': 1e-9,
-    'gate_probability': 0.9999999,
-    'max_tracks': 1,
-    'confirm_hits': 1,
-}
+    **FIXED, **AS_STATED, 'components': 41, 'max_offset': 12.0, 'scale_std': 0.0,
+    'navigation_noise': (0.0, 0.0, 0.0), 'clutter_density': 1e-9, 'gate_probability': 0.9999999,
+    'max_tracks': 1, 'confirm_hits': 1,
+}  # fmt: skip
 """A tracker that does what the exact posterior of the vectors does."""
 
 
@@ -53,11 +46,9 @@ def rows(name):
 
 def navigation(row, stamp_ns):
     return Navigation(
-        stamp_ns=stamp_ns,
-        position=[row['odom_x'], row['odom_y'], row['odom_z']],
-        orientation=[row['qx'], row['qy'], row['qz'], row['qw']],
-        frame_id='odom',
-    )
+        stamp_ns=stamp_ns, position=[row['odom_x'], row['odom_y'], row['odom_z']],
+        orientation=[row['qx'], row['qy'], row['qz'], row['qw']], frame_id='odom',
+    )  # fmt: skip
 
 
 def approach(name):

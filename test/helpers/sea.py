@@ -30,25 +30,22 @@ def motion_case():
 
 def sea_config(case, **values):
     stated = {
-        'sonar_lever': case['lever'].tolist(),
-        'sonar_mount_rpy_deg': case['mount_deg'].tolist(),
-        'tilt_deg': float(case['tilt_deg']),
-        'side': str(case['side']),
-    }
+        'sonar_lever': case['lever'].tolist(), 'sonar_mount_rpy_deg': case['mount_deg'].tolist(),
+        'tilt_deg': float(case['tilt_deg']), 'side': str(case['side']),
+    }  # fmt: skip
     return BathymetryConfig(**{**EXACT, **stated, **values})
 
 
-def navigation(case, *, late_s=0.0):
-    """The poses of the case, their stamps wrong by `late_s`."""
+def navigation(case):
     return [
         Navigation(
-            stamp_ns=START_NS + round((t + late_s) * 1e9),
+            stamp_ns=START_NS + round(t * 1e9),
             position=p,
             orientation=q,
             frame_id='map',
         )
         for t, p, q in zip(case['tn'], case['pn'], case['qn'])
-    ]
+    ]  # fmt: skip
 
 
 def snapshots(case):
@@ -63,16 +60,11 @@ def snapshots(case):
         )
 
 
-def swath_of(case, config, snapshot, *, late_s=0.0, pose_of='reception'):
-    """The swath of one ping, right or with a mistake: `pose_of` all bins is that of
-    ``transmission`` or of the ``middle`` of the ping."""
-    poses = navigation(case, late_s=late_s)
+def swath_of(case, config, snapshot):
+    """The swath of one ping."""
+    poses = navigation(case)
     buffer = NavigationBuffer(tuple(each.stamp_ns for each in poses), tuple(poses))
     stamps = bin_stamps(snapshot, config)
-    if pose_of == 'transmission':
-        stamps = np.full_like(stamps, stamps[0])
-    elif pose_of == 'middle':
-        stamps = np.full_like(stamps, (stamps[0] + stamps[-1]) // 2)
     ranges = snapshot.ranges(config.sound_speed)
     return ship_swath(
         config, ranges, float(case['c']), config.side, float(case['dlam']), buffer.poses(stamps)

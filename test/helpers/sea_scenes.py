@@ -49,13 +49,9 @@ class Score(NamedTuple):
 def sea_scene(name):
     found = load_vectors(f'fathometer_sea/{name}')
     return Scene(
-        found['depth'].astype(float),
-        found['amplitude'].astype(float),
-        found['reflector_depth'],
-        found['reflector_amplitude'],
-        float(found['array_depth']),
-        found,
-    )
+        found['depth'].astype(float), found['amplitude'].astype(float), found['reflector_depth'],
+        found['reflector_amplitude'], float(found['array_depth']), found,
+    )  # fmt: skip
 
 
 def score_scene(found, scene, after):

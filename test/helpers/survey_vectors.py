@@ -36,16 +36,12 @@ def lines(data):
         rows = data['line'] == k
         x, y, z = data['p_mm'][rows].T * 1e-3
         columns = {
-            'x': x,
-            'y': y,
-            'z': z,
-            'vertical_uncertainty': data['vu'][rows].astype(float),
+            'x': x, 'y': y, 'z': z, 'vertical_uncertainty': data['vu'][rows].astype(float),
             'range': data['range_mm'][rows] * 1e-3,
             'beam_angle': data['beam'][rows].astype(float),
-            'side': data['side'][rows].astype(float),
-            'label': data['label'][rows].astype(float),
+            'side': data['side'][rows].astype(float), 'label': data['label'][rows].astype(float),
             'geometry_std': np.zeros(len(x)),
-        }
+        }  # fmt: skip
         made.append(line_of(Points(data['stamp_ns'][rows], columns), BUDGET))
     return made
 

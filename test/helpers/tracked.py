@@ -38,13 +38,10 @@ RUNS = {
     'bathymetry_ship': {'ping_coupling': '1.0'},
     'fathometer_drift': {'smoothing_lag': '2', 'particles': '300'},
     'fathometer_pressure': {
-        'preview_seconds': '5.0',
-        'frequency_max': '1500.0',
-        'processor': 'mvdr',
-        'pulse': 'processor',
-        'particles': '300',
+        'preview_seconds': '5.0', 'frequency_max': '1500.0', 'processor': 'mvdr',
+        'pulse': 'processor', 'particles': '300',
     },
-}
+}  # fmt: skip
 """Recording: parameters that make its tracker quick, and use what else would not be used."""
 
 
@@ -81,12 +78,9 @@ class Tracked:
 def saved(intake, system):
     """The state of a tracker of a system, and of the intake before it."""
     return Saved(
-        system=system.name,
-        parameters=json_parameters(intake.tracker.config),
-        saved_ns=5,
-        newest_ns=7,
-        state=state_of(intake),
-    )
+        system=system.name, parameters=json_parameters(intake.tracker.config), saved_ns=5,
+        newest_ns=7, state=state_of(intake),
+    )  # fmt: skip
 
 
 def tracker_from(saved, system, config):

@@ -12,6 +12,7 @@ from collections import deque
 
 import attrs
 from attrs import evolve
+from helpers.diver_runs import arrivals
 import numpy as np
 import pytest
 
@@ -20,7 +21,6 @@ from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.intake import Intake
 from sonar_imm.measurements import (
     Altitude,
-    Arrivals,
     Fix,
     Fixes,
     Navigation,
@@ -210,17 +210,14 @@ def wandering(k, rng):
         target_id=[k, 10**6 + k, NOBODY],
     )
     for passive in (False, True):
-        yield Arrivals(
-            stamp_ns=stamp_ns,
-            frame_id='map',
+        yield arrivals(
+            stamp_ns,
+            rx,
+            (1.0 + (not passive)) * np.linalg.norm(rx - place, axis=1) / 1500.0,
             tx_id=np.full(4, k),
             rx_id=4 * k + np.arange(4),
             tx=np.full((4, 3), np.nan) if passive else rx[[0, 0, 0, 0]],
-            rx=rx,
-            toa=(1.0 + (not passive)) * np.linalg.norm(rx - place, axis=1) / 1500.0,
-            var_toa=np.full(4, 1e-7),
-            bearing=np.full(4, np.nan),
-            var_bearing=np.full(4, np.nan),
+            var_toa=1e-07,
         )
 
 

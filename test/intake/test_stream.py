@@ -275,6 +275,20 @@ def test_a_frozen_value_of_fine_digits_is_no_fix_however_old():
         assert due or not any(passes(repeats, item) for item in frozen)
 
 
+@pytest.mark.parametrize('latitude, fine', [(80.0, True), (0.0, False)])
+def test_a_degree_of_longitude_is_short_in_the_north(latitude, fine):
+    """Steps of 0.19 m are fine digits beside a deviation of 0.9 m, those of 1.1 m are coarse."""
+    repeats, degrees = RepeatFilter(5.0), {'latitude': latitude, 'covariance': 0.81 * np.eye(3)}
+
+    def at(k, longitude):
+        return GeodeticFix(stamp_ns=(1 + k) * SECOND, longitude=longitude, **degrees)
+
+    for k in range(60):
+        passes(repeats, at(k, 10.0 + 1e-5 * (k // 5)))
+    frozen = [passes(repeats, at(60 + k, 10.0 + 11e-5)) for k in range(60)]
+    assert any(frozen) != fine
+
+
 def test_a_value_that_came_once_each_is_not_held():
     """A vehicle of a simulator without noise that stops: its fixes count after a while."""
     repeats = RepeatFilter(5.0)

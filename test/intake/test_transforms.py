@@ -8,6 +8,7 @@
 
 """Frames that are fixed to each other: the tree, and measurements turned from one into another."""
 
+from helpers.diver_runs import arrivals
 import numpy as np
 import pytest
 
@@ -17,7 +18,6 @@ from sonar_imm.intake import KnownFrames, MOST_FRAMES, moved, TransformTree
 from sonar_imm.measurements import (
     Altitude,
     ArrayDepth,
-    Arrivals,
     Detections,
     Fix,
     Fixes,
@@ -103,16 +103,13 @@ def test_positions_are_turned_with_their_covariances():
 
 def test_arrivals_are_turned_with_their_bearings():
     n = 2
-    ping = Arrivals(
-        stamp_ns=STAMP,
-        tx_id=np.zeros(n),
-        rx_id=np.arange(n),
+    ping = arrivals(
+        STAMP,
+        np.array([[0.0, 0.0, 0.0], [50.0, 0.0, -2.0]]),
+        np.full(n, 0.05),
         tx=np.ones((n, 3)),
-        rx=np.array([[0.0, 0.0, 0.0], [50.0, 0.0, -2.0]]),
-        toa=np.full(n, 0.05),
-        var_toa=np.full(n, 1e-8),
         bearing=np.array([3.0, np.nan]),
-        var_bearing=np.full(n, 0.01),
+        var_bearing=0.01,
     )
     made = moved(ping, 'map', TURNED)
     for k in range(n):

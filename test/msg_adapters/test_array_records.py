@@ -9,6 +9,7 @@
 """Tables of arrays and traces: read back as written, and hostile ones named."""
 
 from attrs import evolve
+from helpers.refusals import reason
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -72,13 +73,6 @@ def trace_table(rows=60, **changes):
 def pressure_table(rows=50, **changes):
     p = np.random.default_rng(1).normal(size=(rows, N)).astype(np.float32)
     return table(**{'p': p, 'sample_rate': np.full(rows, 12e3, np.float32), **changes})
-
-
-def reason(read, message):
-    with pytest.raises(Rejection) as caught:
-        read(message)
-    assert str(caught.value).strip()
-    return caught.value.reason
 
 
 def test_cross_spectra_come_back_as_they_went():
@@ -225,13 +219,9 @@ def test_a_dead_hydrophone_does_not_spoil_the_block():
 def test_traces_come_back_with_their_noise():
     depth = 120.0 + 0.25 * np.arange(80)
     trace = Trace(
-        stamp_ns=STAMP,
-        depth=depth,
-        amplitude=np.cos(depth),
-        sigma=np.full(80, 0.5),
-        frame_id='array',
-        reference_depth=0.0,
-    )
+        stamp_ns=STAMP, depth=depth, amplitude=np.cos(depth), sigma=np.full(80, 0.5),
+        frame_id='array', reference_depth=0.0,
+    )  # fmt: skip
     back = read_trace(write_trace(trace, ros_message))
     assert np.allclose(back.amplitude, trace.amplitude, atol=1e-7)
     assert (back.depth == depth).all() and (back.sigma == 0.5).all()

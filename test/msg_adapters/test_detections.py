@@ -11,6 +11,7 @@
 from types import SimpleNamespace
 
 from helpers import marine
+from helpers.refusals import reason
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -45,34 +46,18 @@ def table(**columns):
     return encode_table(columns, stamp_ns=7, frame_id='sonar', make=ros_message)
 
 
-def reason(read, message, **options):
-    with pytest.raises(Rejection) as caught:
-        read(message, **options)
-    return caught.value.reason
-
-
 # -- our own table -----------------------------------------------------------------------------
 
 
 def test_writing_and_reading_gives_the_same_detections():
     detections = Detections(
-        stamp_ns=1_700_000_000_123_456_789,
-        frame_id='sonar',
-        range=[10.0, 1 / 3],
-        bearing=[PORT, STARBOARD],
-        var_range=[0.25, np.nan],
-        intensity=[3.0, 4.0],
-    )
+        stamp_ns=1_700_000_000_123_456_789, frame_id='sonar', range=[10.0, 1 / 3],
+        bearing=[PORT, STARBOARD], var_range=[0.25, np.nan], intensity=[3.0, 4.0],
+    )  # fmt: skip
     message = write_detections(detections, ros_message)
     assert [field.name for field in message.fields] == [
-        'x',
-        'y',
-        'z',
-        'range',
-        'bearing',
-        'var_range',
-        'intensity',
-    ]
+        'x', 'y', 'z', 'range', 'bearing', 'var_range', 'intensity',
+    ]  # fmt: skip
     again = read_detections(message)
     assert again.stamp_ns == detections.stamp_ns and again.frame_id == 'sonar'
     for name in ('range', 'bearing', 'var_range', 'intensity'):
@@ -151,16 +136,10 @@ def scan(ranges, intensities=(), **fields):
     return ros_message(
         'sensor_msgs/msg/LaserScan',
         **{
-            'header': header(),
-            'angle_min': -0.2,
-            'angle_increment': 0.1,
-            'range_min': 1.0,
-            'range_max': 50.0,
-            'ranges': ranges,
-            'intensities': intensities,
-            **fields,
+            'header': header(), 'angle_min': -0.2, 'angle_increment': 0.1, 'range_min': 1.0,
+            'range_max': 50.0, 'ranges': ranges, 'intensities': intensities, **fields,
         },
-    )
+    )  # fmt: skip
 
 
 def test_a_laser_scan_counts_to_port_and_keeps_what_lies_inside_its_limits():

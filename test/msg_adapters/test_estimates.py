@@ -133,11 +133,9 @@ def test_odometry_shows_the_depth_where_it_is_a_state():
     rng = np.random.default_rng(3)
     root = rng.standard_normal((1, 6, 6))
     deep = evolve(
-        estimate(rows=1),
-        state_names=('px', 'py', 'pz', 'vx', 'vy', 'vz'),
-        state=rng.standard_normal((1, 6)),
-        covariance=root @ root.transpose(0, 2, 1),
-    )
+        estimate(rows=1), state_names=('px', 'py', 'pz', 'vx', 'vy', 'vz'),
+        state=rng.standard_normal((1, 6)), covariance=root @ root.transpose(0, 2, 1),
+    )  # fmt: skip
     message = through_cdr(write_odometry(deep, 0, ros_message))
     place, speed = message.pose.pose.position, message.twist.twist.linear
     assert [place.x, place.y, place.z, speed.x, speed.y, speed.z] == deep.state[0].tolist()
@@ -178,14 +176,9 @@ def test_the_layout_is_what_cube_expects():
     message = write_soundings(soundings(), ros_message)
     names = [field.name for field in message.fields]
     assert names[:7] == [
-        'x',
-        'y',
-        'z',
-        'vertical_uncertainty',
-        'horizontal_uncertainty',
-        'intensity',
+        'x', 'y', 'z', 'vertical_uncertainty', 'horizontal_uncertainty', 'intensity',
         'beam_angle',
-    ]
+    ]  # fmt: skip
     assert all(field.datatype == 7 and field.count == 1 for field in message.fields[:7])
     assert [field.offset for field in message.fields[:7]] == [0, 4, 8, 12, 16, 20, 24]
     assert message.is_dense and message.height == 1

@@ -20,29 +20,19 @@ from sonar_imm_tools.recordings.messages import ros_message
 
 def fix(frame_id='map'):
     return Fix(
-        stamp_ns=5,
-        position=(1.0, 2.0, 3.0),
-        covariance=[[4.0, 0.5], [0.5, 9.0]],
+        stamp_ns=5, position=(1.0, 2.0, 3.0), covariance=[[4.0, 0.5], [0.5, 9.0]],
         frame_id=frame_id,
-    )
+    )  # fmt: skip
 
 
 def arrivals(**changes):
     return Arrivals(
         **{
-            'stamp_ns': 5,
-            'tx_id': [1],
-            'rx_id': [2],
-            'tx': [[1.0, 2.0, 3.0]],
-            'rx': [[4.0, 5.0, 6.0]],
-            'toa': [0.1],
-            'var_toa': [np.nan],
-            'bearing': [0.25],
-            'var_bearing': [0.01],
-            'frame_id': 'map_ned',
-            **changes,
+            'stamp_ns': 5, 'tx_id': [1], 'rx_id': [2], 'tx': [[1.0, 2.0, 3.0]],
+            'rx': [[4.0, 5.0, 6.0]], 'toa': [0.1], 'var_toa': [np.nan], 'bearing': [0.25],
+            'var_bearing': [0.01], 'frame_id': 'map_ned', **changes,
         }
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -139,13 +139,9 @@ ROOT = str(Path(sonar_imm.__file__).parent.parent)
 
 def import_with(*path):
     return subprocess.run(
-        [sys.executable, '-c', 'import sonar_imm'],
-        capture_output=True,
-        text=True,
-        cwd='/',
-        check=False,
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join(path)},
-    )
+        [sys.executable, '-c', 'import sonar_imm'], capture_output=True, text=True, cwd='/',
+        check=False, env={**os.environ, 'PYTHONPATH': os.pathsep.join(path)},
+    )  # fmt: skip
 
 
 def test_our_own_adapters_are_ours():

@@ -11,6 +11,7 @@
 import math
 
 from helpers import marine
+from helpers.refusals import reason
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -51,12 +52,6 @@ def navigation(**values):
 
 def odometry(**values):
     return write_navigation(navigation(**values), ros_message)
-
-
-def reason(read, message, **options):
-    with pytest.raises(Rejection) as caught:
-        read(message, **options)
-    return caught.value.reason
 
 
 def test_writing_and_reading_gives_the_same_navigation():
@@ -105,14 +100,10 @@ def test_an_frd_vehicle_in_ned_becomes_an_flu_vehicle_in_enu():
         root = random.normal(size=(2, 6, 6))
         pose, twist = root @ np.swapaxes(root, 1, 2)
         stated = navigation(
-            orientation=R.as_quat(),
-            position=random.normal(size=3),
-            velocity=random.normal(size=3),
-            turn_rate=random.normal(size=3),
-            pose_covariance=pose,
-            twist_covariance=twist,
-            child_frame_id='base_link_frd',
-        )
+            orientation=R.as_quat(), position=random.normal(size=3),
+            velocity=random.normal(size=3), turn_rate=random.normal(size=3), pose_covariance=pose,
+            twist_covariance=twist, child_frame_id='base_link_frd',
+        )  # fmt: skip
         turned = read_navigation(write_navigation(stated, ros_message), world_frame='ned')
         expected = W @ R.as_matrix() @ B
         assert np.allclose(Rotation.from_quat(turned.orientation).as_matrix(), expected)
@@ -200,12 +191,10 @@ def test_the_altitude_of_a_doppler_log_needs_bottom_lock():
 
 def stonefish(altitude):
     return marine.make(
-        'stonefish_ros2/msg/DVL',
-        header=marine.header(),
-        velocity=marine.vectors([(1.0, 0.0, 0.0)])[0],
-        velocity_covariance=np.zeros(9),
+        'stonefish_ros2/msg/DVL', header=marine.header(),
+        velocity=marine.vectors([(1.0, 0.0, 0.0)])[0], velocity_covariance=np.zeros(9),
         altitude=altitude,
-    )
+    )  # fmt: skip
 
 
 def dave(distance, target='bottom'):

@@ -52,40 +52,26 @@ def make_rclpy(type_name, /, **fields):
 
 def fix():
     return Fix(
-        stamp_ns=1700000000123456789,
-        position=(1 / 3, 2.0, 3.0),
-        covariance=[[4.0, 0.5], [0.5, 9.0]],
-        frame_id='map',
-    )
+        stamp_ns=1700000000123456789, position=(1 / 3, 2.0, 3.0),
+        covariance=[[4.0, 0.5], [0.5, 9.0]], frame_id='map',
+    )  # fmt: skip
 
 
 def arrivals():
     return Arrivals(
-        stamp_ns=10**18,
-        tx_id=[1, 1],
-        rx_id=[2, 3],
-        tx=np.ones((2, 3)),
-        rx=np.zeros((2, 3)),
-        toa=[0.1, 1 / 3],
-        var_toa=np.float32([1e-6, np.nan]),
-        bearing=[0.3, -0.4],
-        var_bearing=np.float32([0.01, 0.02]),
-        frame_id='map',
-    )
+        stamp_ns=10**18, tx_id=[1, 1], rx_id=[2, 3], tx=np.ones((2, 3)), rx=np.zeros((2, 3)),
+        toa=[0.1, 1 / 3], var_toa=np.float32([1e-6, np.nan]), bearing=[0.3, -0.4],
+        var_bearing=np.float32([0.01, 0.02]), frame_id='map',
+    )  # fmt: skip
 
 
 def estimate():
     return Estimate(
-        stamp_ns=10**18,
-        frame_id='map',
-        xyz=np.zeros((1, 3), np.float32),
-        state_names=('px', 'py', 'vx', 'vy'),
-        state=np.array([[1 / 3, 2.0, 0.3, 0.4]]),
-        covariance=np.eye(4)[None] * 0.1,
-        model_names=('a', 'b'),
-        probabilities=np.array([[0.25, 0.75]]),
-        extras={'track_id': np.array([4], np.uint32)},
-    )
+        stamp_ns=10**18, frame_id='map', xyz=np.zeros((1, 3), np.float32),
+        state_names=('px', 'py', 'vx', 'vy'), state=np.array([[1 / 3, 2.0, 0.3, 0.4]]),
+        covariance=np.eye(4)[None] * 0.1, model_names=('a', 'b'),
+        probabilities=np.array([[0.25, 0.75]]), extras={'track_id': np.array([4], np.uint32)},
+    )  # fmt: skip
 
 
 def messages(make):

@@ -9,6 +9,7 @@
 """Positions from transceivers: what each driver means, and what it flags."""
 
 from helpers.marine import driver_message
+from helpers.refusals import reason
 import numpy as np
 import pytest
 
@@ -27,23 +28,11 @@ from sonar_imm_tools.recordings.messages import ros_message
 STAMP = 7_000_000_000
 
 
-def reason(read, message):
-    with pytest.raises(Rejection) as caught:
-        read(message)
-    return caught.value.reason
-
-
 def modem(**values):
     given = {
-        'header__stamp__sec': 7,
-        'header__frame_id': 'x150',
-        'src_id': 3,
-        'includes_range': True,
-        'range_dist': 200,
-        'includes_usbl': True,
-        'usbl_azimuth': 900,
-        'usbl_elevation': -300,
-    }
+        'header__stamp__sec': 7, 'header__frame_id': 'x150', 'src_id': 3, 'includes_range': True,
+        'range_dist': 200, 'includes_usbl': True, 'usbl_azimuth': 900, 'usbl_elevation': -300,
+    }  # fmt: skip
     return driver_message('seatrac_interfaces/msg/ModemRec', **{**given, **values})
 
 
@@ -58,14 +47,10 @@ def test_a_modem_gives_range_and_direction_clockwise_and_up():
 def test_a_modem_without_direction_gives_its_position():
     fix = read_modem(
         modem(
-            includes_usbl=False,
-            includes_position=True,
-            position_easting=100,
-            position_northing=-50,
-            position_depth=80,
-            depth_local=20,
+            includes_usbl=False, includes_position=True, position_easting=100,
+            position_northing=-50, position_depth=80, depth_local=20,
         )
-    )
+    )  # fmt: skip
     assert fix.levelled and fix.offset == pytest.approx([10.0, -5.0, -6.0])
 
 
@@ -103,13 +88,9 @@ def test_usbl_data_without_attitude_is_in_axes_of_the_device():
 
 def test_a_simulated_beacon_is_forward_starboard_down():
     message = driver_message(
-        'stonefish_ros2/msg/BeaconInfo',
-        header__stamp__sec=7,
-        beacon_id=8,
-        relative_position__x=30.0,
-        relative_position__y=4.0,
-        relative_position__z=5.0,
-    )
+        'stonefish_ros2/msg/BeaconInfo', header__stamp__sec=7, beacon_id=8,
+        relative_position__x=30.0, relative_position__y=4.0, relative_position__z=5.0,
+    )  # fmt: skip
     fix = read_beacon(message)
     assert fix.offset.tolist() == [30.0, -4.0, -5.0] and fix.target_id == 8
     nothing = driver_message('stonefish_ros2/msg/BeaconInfo', header__stamp__sec=7)

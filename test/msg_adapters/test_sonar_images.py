@@ -50,29 +50,20 @@ def projected(order='range_major', axes='rep103', **change):
     port, ahead, none = np.sin(BEARINGS), np.cos(BEARINGS), np.zeros(len(BEARINGS))
     beams = np.column_stack([ahead, port, none] if axes == 'rep103' else [none, -port, ahead])
     return marine.make(
-        'ProjectedSonarImage',
-        header=marine.header(),
-        ping_info=marine.ping_info(),
-        beam_directions=marine.vectors(beams),
-        ranges=marine.floats(RANGES),
+        'ProjectedSonarImage', header=marine.header(), ping_info=marine.ping_info(),
+        beam_directions=marine.vectors(beams), ranges=marine.floats(RANGES),
         image=data(picture(), order, **change),
-    )
+    )  # fmt: skip
 
 
 def raw(sample0=8, rate=3000.0, sound_speed=1500.0):
     """c / (2 rate) = 0.25 m a sample: sample0 = 8 begins at 2 m."""
     return marine.make(
-        'RawSonarImage',
-        header=marine.header(),
-        ping_info=marine.ping_info(sound_speed),
-        sample_rate=rate,
-        samples_per_beam=len(RANGES),
-        sample0=sample0,
-        tx_delays=marine.floats([]),
-        tx_angles=marine.floats([]),
-        rx_angles=marine.floats(-BEARINGS),
-        image=data(picture(), 'range_major'),
-    )
+        'RawSonarImage', header=marine.header(), ping_info=marine.ping_info(sound_speed),
+        sample_rate=rate, samples_per_beam=len(RANGES), sample0=sample0,
+        tx_delays=marine.floats([]), tx_angles=marine.floats([]),
+        rx_angles=marine.floats(-BEARINGS), image=data(picture(), 'range_major'),
+    )  # fmt: skip
 
 
 def config(**values):
@@ -201,10 +192,8 @@ def samples(values):
     [
         ({'intensity_quantity': AMPLITUDE, 'intensity_scale': LINEAR}, lambda a: a),
         ({'intensity_quantity': POWER, 'intensity_scale': LINEAR}, np.square),
-        (
-            {'intensity_quantity': POWER, 'intensity_scale': DECIBEL, 'scale': 0.25},
-            lambda a: 80.0 * np.log10(np.maximum(a, 0.1)),
-        ),
+        ({'intensity_quantity': POWER, 'intensity_scale': DECIBEL, 'scale': 0.25},
+         lambda a: 80.0 * np.log10(np.maximum(a, 0.1))),
         (
             {
                 'intensity_quantity': POWER,
@@ -215,17 +204,15 @@ def samples(values):
             lambda a: np.square(a) / 4.0 + 2.0,
         ),
     ],
-)
+)  # fmt: skip
 @pytest.mark.parametrize('stated', ['amplitude', 'decibel'])
 def test_what_the_sonar_says_of_a_sample_counts_in_place_of_the_parameters(
     fields, of_amplitude, stated
 ):
     _, found = described(
-        sonar_info(**fields),
-        samples(of_amplitude(picture())),
-        image_scale=stated,
+        sonar_info(**fields), samples(of_amplitude(picture())), image_scale=stated,
         decibel_step=3.0,
-    )
+    )  # fmt: skip
     assert found.range == pytest.approx([RANGES[40], RANGES[90]], abs=0.02)
     assert found.intensity == pytest.approx([200.0, 120.0])
 
@@ -366,10 +353,8 @@ def test_the_whole_packet_of_an_oculus_is_read_from_its_end():
         ({'ping_data': np.zeros(0, np.uint8)}, 'short_data'),
         ({'step': 3, 'ping_data': np.zeros(24, np.uint8)}, 'short_data'),
         ({'step': 2**32 - 1}, 'short_data'),
-        (
-            {'n_ranges': 65535, 'n_beams': 65535, 'bearings': np.zeros(65535, np.int16)},
-            'too_large',
-        ),
+        ({'n_ranges': 65535, 'n_beams': 65535, 'bearings': np.zeros(65535, np.int16)},
+         'too_large'),
         ({'n_beams': 5}, 'bad_shape'),
         ({'bearings': np.zeros(0, np.int16)}, 'bad_shape'),
         ({'sample_size': 3}, 'bad_field'),
@@ -378,7 +363,7 @@ def test_the_whole_packet_of_an_oculus_is_read_from_its_end():
         ({'range_resolution': 0.0}, 'out_of_range'),
         ({'range_resolution': 1e300}, 'out_of_range'),
     ],
-)
+)  # fmt: skip
 def test_an_oculus_ping_that_cannot_be_is_refused(changes, code):
     assert refused(oculus(**changes)) == code
 
@@ -388,16 +373,10 @@ def test_an_oculus_ping_that_cannot_be_is_refused(changes, code):
 
 def ping360(angle=0.3, **changes):
     values = {
-        'header': marine.header(),
-        'angle': angle,
-        'gain': 1,
-        'number_of_samples': 4,
-        'transmit_frequency': 740,
-        'speed_of_sound': 1500,
-        'range': 20,
-        'intensities': np.array([1, 200, 3, 4], np.uint8),
-        **changes,
-    }
+        'header': marine.header(), 'angle': angle, 'gain': 1, 'number_of_samples': 4,
+        'transmit_frequency': 740, 'speed_of_sound': 1500, 'range': 20,
+        'intensities': np.array([1, 200, 3, 4], np.uint8), **changes,
+    }  # fmt: skip
     return marine.make('ping360_sonar_msgs/msg/SonarEcho', **values)
 
 
@@ -448,15 +427,11 @@ def photo(pixels=PIXELS, encoding='mono8', dtype='u1', big=False, pad=0, **chang
     rows = pixels.astype(('>' if big else '<') + dtype)
     data = b''.join(row.tobytes() + bytes(pad) for row in rows)
     values = {
-        'header': marine.header(),
-        'height': pixels.shape[0],
-        'width': pixels.shape[1],
-        'encoding': encoding,
-        'is_bigendian': int(big),
-        'step': pixels.shape[1] * rows.itemsize + pad,
-        'data': np.frombuffer(data, np.uint8),
+        'header': marine.header(), 'height': pixels.shape[0], 'width': pixels.shape[1],
+        'encoding': encoding, 'is_bigendian': int(big),
+        'step': pixels.shape[1] * rows.itemsize + pad, 'data': np.frombuffer(data, np.uint8),
         **changes,
-    }
+    }  # fmt: skip
     return marine.make('sensor_msgs/msg/Image', **values)
 
 
@@ -529,12 +504,10 @@ def test_an_array_that_cannot_be_is_refused(message, code):
 @pytest.mark.parametrize('factor, encoding', [(1.0, 'mono8'), (0.5, '32FC1'), (300.0, '32FC1')])
 def test_a_written_picture_is_read_again(factor, encoding):
     image = SonarImage(
-        stamp_ns=7,
-        range=3.25 + 2.5 * np.arange(8),
-        bearing=np.radians([25.0, 15.0, 5.0, -5.0, -15.0, -25.0]),
-        amplitude=factor * PIXELS,
+        stamp_ns=7, range=3.25 + 2.5 * np.arange(8),
+        bearing=np.radians([25.0, 15.0, 5.0, -5.0, -15.0, -25.0]), amplitude=factor * PIXELS,
         frame_id='sonar',
-    )
+    )  # fmt: skip
     message = write_picture(image, ros_message)
     assert message.encoding == encoding
     again = read_sent(message, **GEOMETRY)

@@ -105,15 +105,9 @@ def test_hostile_snapshots_are_named_and_counted_and_the_node_lives(rig):
     refused = rig.node._meter.refused
     assert refused.total() == 11 and not rig.tables and not rig.node._errors
     assert {
-        'too_short',
-        'too_large',
-        'bad_range',
-        'bad_field',
-        'nan',
-        'silent',
-        'missing_column',
+        'too_short', 'too_large', 'bad_range', 'bad_field', 'nan', 'silent', 'missing_column',
         'not_constant',
-    } <= set(refused)
+    } <= set(refused)  # fmt: skip
     rig.send(write_snapshot(good, make))
     assert len(read_estimate(rig.tables[0])) == len(good)
 

@@ -37,14 +37,9 @@ class Desk:
 
     def report(self, now, **changes):
         state = {
-            'enabled': True,
-            'stale_after': 5.0,
-            'counts': Counter(used=3),
-            'health': {'NIS': 1.5},
-            'lost': {},
-            'incompatible': {},
-            **changes,
-        }
+            'enabled': True, 'stale_after': 5.0, 'counts': Counter(used=3),
+            'health': {'NIS': 1.5}, 'lost': {}, 'incompatible': {}, **changes,
+        }  # fmt: skip
         message = self.reporter.report(Time(sec=9), now, **state)
         assert message.header.stamp.sec == 9
         self.input, self.tracker = message.status
@@ -178,23 +173,15 @@ def test_one_input_of_several_that_serve_is_enough(desk):
     'system, settings, required, one_of',
     [
         ('diver', {}, [], ['fix', 'fixes', 'relative', 'arrivals']),
-        (
-            'diver',
-            {'tags': ('amy',)},
-            [],
-            ['fix', 'amy/fix', 'fixes', 'relative', 'amy/relative', 'arrivals'],
-        ),
+        ('diver', {'tags': ('amy',)}, [],
+         ['fix', 'amy/fix', 'fixes', 'relative', 'amy/relative', 'arrivals']),
         ('obstacle', {}, ['detections', 'nav'], []),
         ('bathymetry', {}, [], ['snapshot', 'port/snapshot', 'starboard/snapshot']),
-        (
-            'bathymetry',
-            {'navigation': 'required'},
-            ['nav'],
-            ['snapshot', 'port/snapshot', 'starboard/snapshot'],
-        ),
+        ('bathymetry', {'navigation': 'required'}, ['nav'],
+         ['snapshot', 'port/snapshot', 'starboard/snapshot']),
         ('fathometer', {}, [], ['csdm', 'pressure', 'trace']),
     ],
-)
+)  # fmt: skip
 def test_what_each_system_needs(system, settings, required, one_of):
     assert needed(inputs_of(system), settings) == (required, one_of)
 

@@ -140,14 +140,12 @@ def test_a_diver_is_tracked_from_fixes(rig):
         publisher.publish(
             write_fix(
                 Fix(
-                    stamp_ns=second * 10**9,
-                    position=(1.0 * second, 0.0, 0.0),
-                    covariance=0.01 * np.eye(2),
-                    frame_id='map',
+                    stamp_ns=second * 10**9, position=(1.0 * second, 0.0, 0.0),
+                    covariance=0.01 * np.eye(2), frame_id='map',
                 ),
                 make,
             )
-        )
+        )  # fmt: skip
         bench.spin_until(lambda want=second: node._meter.received['fix'] == want)
     bench.spin_until(lambda: odometry and odometry[-1].header.stamp.sec == 30)
     assert odometry[-1].pose.pose.position.x == pytest.approx(30.0, abs=0.5)
@@ -167,12 +165,10 @@ def test_scans_are_heard_and_an_empty_one_is_a_missed_detection(make_bench):
     for second in range(1, 8):
         places = [[0.5 * second, 0.0, 0.0]] if second < 7 else np.empty((0, 3))
         scan = Fixes(
-            stamp_ns=second * 10**9,
-            position=places,
+            stamp_ns=second * 10**9, position=places,
             covariance=np.tile(np.eye(2), (len(places), 1, 1)),
-            target_id=np.full(len(places), -1),
-            frame_id='map',
-        )
+            target_id=np.full(len(places), -1), frame_id='map',
+        )  # fmt: skip
         publisher.publish(write_scan(scan, make))
     bench.spin_until(lambda: len(estimates) == 7)
     states = [read_estimate(message).extras['track_state'].tolist() for message in estimates]
@@ -202,14 +198,11 @@ def on_earth(k, x, status=0, topic_frame='gps'):
     latitude, longitude, _ = ORIGIN.geodetic(np.array([x, 5.0, 0.0]))
     message = write_geodetic(
         GeodeticFix(
-            stamp_ns=k * SECOND,
-            latitude=latitude,
-            longitude=longitude,
-            covariance=0.04 * np.eye(3),
-            frame_id=topic_frame,
+            stamp_ns=k * SECOND, latitude=latitude, longitude=longitude,
+            covariance=0.04 * np.eye(3), frame_id=topic_frame,
         ),
         make,
-    )
+    )  # fmt: skip
     message.status.status = status
     return message
 
@@ -315,13 +308,11 @@ POSE = PoseWithCovarianceStamped
 def told(second, x, frame_id='map'):
     return write_start(
         Start(
-            stamp_ns=second * SECOND,
-            position=[x, 2.0, 0.0],
-            covariance=np.eye(2),
+            stamp_ns=second * SECOND, position=[x, 2.0, 0.0], covariance=np.eye(2),
             frame_id=frame_id,
         ),
         make,
-    )
+    )  # fmt: skip
 
 
 def test_a_start_begins_a_track_and_a_useless_one_is_refused_by_name(make_bench, capfd):

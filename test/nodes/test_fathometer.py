@@ -131,14 +131,11 @@ def blocks_of(seconds, *, hydrophones=8, rate=4000.0, block=0.5, seed=5):
     n = round(block * rate)
     return [
         Pressure(
-            stamp_ns=START + round(k * block * 1e9),
-            frame_id='array',
-            pressure=rng.normal(size=(n, hydrophones)),
-            sample_rate=rate,
-            reference_depth=70.0,
+            stamp_ns=START + round(k * block * 1e9), frame_id='array',
+            pressure=rng.normal(size=(n, hydrophones)), sample_rate=rate, reference_depth=70.0,
         )
         for k in range(round(seconds / block))
-    ]
+    ]  # fmt: skip
 
 
 def test_pressure_makes_records_and_previews_between_them(make_bench):
@@ -156,15 +153,9 @@ def test_pressure_makes_records_and_previews_between_them(make_bench):
 
 
 RECORD = (
-    'phones:=12',
-    'element_spacing:=0.36',
-    'frequency_max:=2000.0',
-    'snapshot_seconds:=0.5',
-    'record_seconds:=19.5',
-    'depth_min:=122.0',
-    'depth_max:=172.0',
-    'particles:=2000',
-)
+    'phones:=12', 'element_spacing:=0.36', 'frequency_max:=2000.0', 'snapshot_seconds:=0.5',
+    'record_seconds:=19.5', 'depth_min:=122.0', 'depth_max:=172.0', 'particles:=2000',
+)  # fmt: skip
 
 
 @pytest.fixture(scope='module')
@@ -187,13 +178,10 @@ def spectra_of(messages, stamp_ns):
     parts = stream.push(np.concatenate([block.pressure for block in blocks]))
     (average,) = BlockAverage(len(parts)).push(parts)
     return CrossSpectra(
-        stamp_ns=stamp_ns,
-        frame_id=blocks[0].frame_id,
-        frequency=2.0 * np.arange(first, last + 1),
-        csdm=average.csdm,
-        snapshots=average.snapshots,
-        reference_depth=blocks[0].reference_depth,
-    )
+        stamp_ns=stamp_ns, frame_id=blocks[0].frame_id,
+        frequency=2.0 * np.arange(first, last + 1), csdm=average.csdm,
+        snapshots=average.snapshots, reference_depth=blocks[0].reference_depth,
+    )  # fmt: skip
 
 
 def test_pressure_gives_the_estimate_of_its_cross_spectra(make_bench, received):

@@ -39,14 +39,11 @@ def pixels():
 def picture(second=100, spoilt=False, frame_id='sonar'):
     message = write_picture(
         SonarImage(
-            stamp_ns=second * 10**9,
-            range=np.arange(50.0),
-            bearing=np.arange(9.0),
-            amplitude=pixels().astype(float),
-            frame_id=frame_id,
+            stamp_ns=second * 10**9, range=np.arange(50.0), bearing=np.arange(9.0),
+            amplitude=pixels().astype(float), frame_id=frame_id,
         ),
         make,
-    )
+    )  # fmt: skip
     if spoilt:
         message.data = message.data[:-1]
     return message
@@ -63,13 +60,9 @@ def projected():
         ),
         ranges=marine.floats(np.arange(1.0, 51.0)),
         image=marine.make(
-            'SonarImageData',
-            is_bigendian=False,
-            dtype=0,
-            beam_count=9,
-            data=pixels().ravel(),
+            'SonarImageData', is_bigendian=False, dtype=0, beam_count=9, data=pixels().ravel(),
         ),
-    )
+    )  # fmt: skip
 
 
 def counts(message):
@@ -103,11 +96,8 @@ def test_every_image_is_answered_and_a_bad_one_refused(make_bench):
     assert [item.header.stamp.sec for item in received] == [100, 102]
     assert node.refused == {'short_data': 1}
     assert counts(answers[-1]) == {
-        'messages': 3,
-        'refused': 1,
-        'estimates': 2,
-        'listeners': 1,
-    }
+        'messages': 3, 'refused': 1, 'estimates': 2, 'listeners': 1,
+    }  # fmt: skip
     assert answers[-1].header.stamp.sec == 102
     before = len(given)
     bench.spin_until(lambda: len(given) > before + 1)

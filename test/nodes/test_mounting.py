@@ -43,11 +43,9 @@ def transform(child, parent, position, rpy):
         ),
     }
     return make(
-        ALONE,
-        header=make('std_msgs/msg/Header', frame_id=parent),
-        child_frame_id=child,
+        ALONE, header=make('std_msgs/msg/Header', frame_id=parent), child_frame_id=child,
         transform=make('geometry_msgs/msg/Transform', **where),
-    )
+    )  # fmt: skip
 
 
 class Life:
@@ -123,11 +121,9 @@ def test_a_place_that_was_said_before_the_node_was_there_is_heard(make_bench):
 def test_a_track_that_was_told_and_frames_outlive_their_publishers(make_bench, tmp_path, capfd):
     def fix_at(topic, seconds, frame_id, x, y):
         fix = Fix(
-            stamp_ns=round(seconds * 1e9),
-            position=(x, y, 0.0),
-            covariance=np.eye(2),
+            stamp_ns=round(seconds * 1e9), position=(x, y, 0.0), covariance=np.eye(2),
             frame_id=frame_id,
-        )
+        )  # fmt: skip
         entry = next(item for item in inputs_of('diver') if item.name == topic.rpartition('/')[2])
         return topic, entry.write(fix, make), next(iter(entry.readers))
 

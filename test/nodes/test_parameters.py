@@ -80,27 +80,21 @@ def test_an_empty_list_empties_a_list(start):
     'parameter, sentence',
     [
         ('sound_speed:=1500', "parameter 'sound_speed' is a double: write 1500.0 instead of 1500"),
-        (
-            'offsets:=[1, 2]',
-            "parameter 'offsets' is a list of doubles: write [1.0, 2.0] instead of [1, 2]",
-        ),
-        (
-            'sound_speed:=15.0',
-            "parameter 'sound_speed' must be between 1300 and 1700, got 15.0 m/s",
-        ),
+        ('offsets:=[1, 2]',
+         "parameter 'offsets' is a list of doubles: write [1.0, 2.0] instead of [1, 2]"),
+        ('sound_speed:=15.0',
+         "parameter 'sound_speed' must be between 1300 and 1700, got 15.0 m/s"),
         ('sound_speed:=.nan', "parameter 'sound_speed' must be finite, got nan"),
         ('sound_speed:=fast', "parameter 'sound_speed' must be of type double, got string 'fast'"),
         ('steps:=2.5', "parameter 'steps' must be of type integer, got double 2.5"),
         ('weights:=[0.5, 7.0]', "parameter 'weights' must be between 0 and 1, got 7.0"),
-        (
-            'mood:=hastey',
-            "parameter 'mood' must be one of calm, hasty, got 'hastey' (did you mean 'hasty'?)",
-        ),
+        ('mood:=hastey',
+         "parameter 'mood' must be one of calm, hasty, got 'hastey' (did you mean 'hasty'?)"),
         ('steps:=[]', "parameter 'steps' is given without a value"),
         ('fast_share:=0.5', 'fast_share and slow_share must sum to 1'),
         ('queue_depth:=0', "parameter 'queue_depth' must be between 1 and 100000, got 0"),
     ],
-)
+)  # fmt: skip
 def test_bad_start_values_are_explained(start, parameter, sentence):
     problems = refusal(start, parameter)
     assert problems == (sentence,)

@@ -47,6 +47,8 @@ def test_yaml_json_and_the_message_say_the_same(tmp_path):
     }
     texts = [MESSAGE, json.dumps(place), json.dumps([place])]
     texts += [json.dumps({**place, 'time': '2023-11-14T22:13:23.5Z'})]
+    for flat in ([4, 0.5, 0.5, 9], [4, 0.5, 0, 0.5, 9, 0, 0, 0, 1]):
+        texts.append(json.dumps({**place, 'covariance': flat}))
     found = [read_initial(written(tmp_path, text)) for text in texts]
     assert all(each == found[0] for each in found)
     start = found[0][0].start(0, {})

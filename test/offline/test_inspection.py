@@ -83,17 +83,10 @@ def test_several_fixes_of_one_stamp_are_a_scan(tmp_path, capsys):
 
 def test_two_pings_of_one_stamp_are_a_problem(tmp_path):
     ping = Arrivals(
-        stamp_ns=START_NS,
-        frame_id='map',
-        tx_id=[0, 0, 0],
-        rx_id=[1, 2, 3],
-        tx=np.zeros((3, 3)),
-        rx=np.diag([40.0, 50.0, 60.0]),
-        toa=[0.05, 0.06, 0.07],
-        var_toa=np.full(3, np.nan),
-        bearing=np.full(3, np.nan),
-        var_bearing=np.full(3, np.nan),
-    )
+        stamp_ns=START_NS, frame_id='map', tx_id=[0, 0, 0], rx_id=[1, 2, 3], tx=np.zeros((3, 3)),
+        rx=np.diag([40.0, 50.0, 60.0]), toa=[0.05, 0.06, 0.07], var_toa=np.full(3, np.nan),
+        bearing=np.full(3, np.nan), var_bearing=np.full(3, np.nan),
+    )  # fmt: skip
     with BagWriter(tmp_path / 'bag') as bag:
         for k in range(2):
             bag.write('/arrivals', write_arrivals(ping, ros_message), START_NS + k)

@@ -12,6 +12,7 @@ import csv
 import json
 import re
 
+from helpers.commands import contents
 from helpers.dive_bags import write_dive
 from helpers.dive_scenes import single_run, START_NS
 import numpy as np
@@ -37,16 +38,12 @@ def folder(tmp_path):
     return folder
 
 
-def contents(folder):
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in folder.rglob('*')
-        if path.is_file()
-    }
-
-
 def test_estimates_come_back_bit_for_bit(folder):
-    assert folder.write_estimates(ESTIMATES, 'diver') == {'estimates': 20, 'rows': 20}
+    assert folder.write_estimates(ESTIMATES, 'diver') == {
+        'first_stamp_ns': ESTIMATES[0].stamp_ns,
+        'estimates': 20,
+        'rows': 20,
+    }
     for read, written in zip(folder.read_estimates(), ESTIMATES, strict=True):
         np.testing.assert_array_equal(read.state, written.state)
         np.testing.assert_array_equal(read.covariance, written.covariance)
@@ -257,6 +254,8 @@ def test_a_run_says_how_large_it_is_and_how_fast_it_was(tmp_path, capsys):
     assert there - own <= run['written_bytes'] <= there
     read = run['timings']['mb_per_s'] * run['timings']['wall_s']
     assert read == pytest.approx(run['bag_bytes'] * 1e-6)
+    p50, p99, total = (run['timings'][f'tracker_{name}_ms'] for name in ('p50', 'p99', 'total'))
+    assert 0.0 < p50 <= p99 <= total < 1e3 * run['timings']['wall_s']
     assert re.search(
         r'^  0\.\d+ MB read at \S+ MB/s, 0\.\d+ MB written$', capsys.readouterr().out, re.M
     )

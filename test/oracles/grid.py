@@ -56,20 +56,3 @@ def filter_densities(
         log_sums[t] = best + np.log(p.sum())
         density[t] = p = p / p.sum()
     return Filtered(density, log_sums)
-
-
-def smooth_densities(
-    density: FloatArray, transition: FloatArray, sigma: FloatArray, log_likelihood: FloatArray
-) -> FloatArray:
-    """Smoothed densities (T, M, G) from the filtered ones; arguments as in
-    `filter_densities`."""
-    T, M, G = density.shape
-    smoothed, beta = density.copy(), np.ones((M, G))
-    for t in range(T - 2, -1, -1):
-        L = np.exp(log_likelihood[t + 1] - log_likelihood[t + 1].max())
-        back = np.stack([walk_matrix(G, s) @ (L * b) for b, s in zip(beta, sigma[t + 1])])
-        beta = transition @ back
-        beta /= beta.max()
-        smoothed[t] = density[t] * beta
-        smoothed[t] /= smoothed[t].sum()
-    return smoothed

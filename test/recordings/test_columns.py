@@ -13,12 +13,13 @@ import pytest
 
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.convert import KINDS
-from sonar_imm_tools.recordings.csv_table import CsvOptions, CsvTable
+from sonar_imm_tools.recordings.csv_table import CsvTable
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.places import Degrees
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.times import BadRow
 
 
@@ -30,6 +31,16 @@ def table(tmp_path):
         return CsvTable(path, CsvOptions(**options))
 
     return make
+
+
+def converted(folder, text, kind, *options):
+    """The measurements of a table; none where it is refused."""
+    (folder / 'in.csv').write_text(text, encoding='utf-8')
+    words = ['convert', kind, str(folder / 'in.csv'), str(folder / 'bag'), *options]
+    if main(words) != 0:
+        return []
+    with BagReader(folder / 'bag') as bag:
+        return [item.measurement for item in measurements_of(bag, 'diver')]
 
 
 @pytest.mark.parametrize(
@@ -51,6 +62,9 @@ def table(tmp_path):
         ('time;Distance;Relèvement;Cap', 'stamp range bearing heading'),
         ('Zeit;Entfernung;Peilung;Zielnummer', 'stamp range bearing id'),
         ('time;Target Lat;Target Lon', 'stamp latitude longitude'),
+        ('Latitude_deg;lon [deg]', 'latitude longitude'),
+        ('GPS Lat;GPS Long', 'latitude longitude'),
+        ('lat_dd;lon_dd', 'latitude longitude'),
     ],
 )
 def test_headers_in_six_languages(table, headers, found):
@@ -88,6 +102,10 @@ def test_the_sign_of_a_hemisphere_is_no_northing(table):
         ('bearing', 'Peilung [°]', 180, 3.14159265),
         ('bearing', 'bearing', 0.5, 0.5),
         ('std_toa', 'std_toa_ms', 2, 0.002),
+        ('x', 'Est (pieds)', 10, 3.048),
+        ('x', 'East [yd]', 100, 91.44),
+        ('y', 'X (North)', 3, 3),
+        ('x', 'Y (Rechtswert)', 3, 3),
     ],
 )
 def test_units_of_headers_are_heeded(table, name, header, cell, value):
@@ -127,14 +145,29 @@ PLACES = [
     ('lat,lon', '59.43 S,10.47 W', (-59.43, -10.47)),
     ('lat,lon', '59.43S,10.47W', (-59.43, -10.47)),
     ('lat,lon', '-59 25.8,-10 28.2', (-59.43, -10.47)),
-]
+    # O is east beside W, and west beside E
+    ('lat,ns,lon,ew', '33,S,70,O\n2,33,S,70,W', (-33.0, 70.0)),
+    ('lat,ns,lon,ew', '33,S,70,O\n2,33,S,70,E', (-33.0, -70.0)),
+    ('lat,ns,lon,O/W', '33,S,70,O', (-33.0, 70.0)),
+    ('lat,ns,lon,E/O', '33,S,70,O', (-33.0, -70.0)),
+    # an S of something else, and a diver of that name
+    ('lat,lon,foo,mode,bar', '33,70,1,S,2\n2,33,70,1,N,3\n3,33,70,1,A,3', (33.0, 70.0)),
+    ('name,lat,lon,id', 'S,33.5,70.25,E', (33.5, 70.25)),
+    ('lat_deg,lat_min,lon_deg,lon_min', '-59,25.8,0,28.2', (-59.43, 0.47)),
+    ('lat_deg,lat_min,lon_deg,lon_min', '59,25.8,-0,28.2', (59.43, -0.47)),
+    ('Breite Grad,Breite Minuten,Länge Grad,Länge Minuten', '59,25.8,10,28.2', (59.43, 10.47)),
+    ('Lat Deg,Lat Min,Lat Sec,ns,Lon Deg,Lon Min,Lon Sec,ew', '59,25,48,S,10,28,12,W',
+     (-59.43, -10.47)),
+    ('Latitude (S),Longitude (°W)', '33.5,70.25', (-33.5, -70.25)),
+    ('Latitude (°S),Longitude (E+)', '33.5,-70.25', (-33.5, -70.25)),
+    ('Latitud (Norte),Longitud (Oeste)', '33.5,70.25', (33.5, -70.25)),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize('header, cells, place', PLACES)
 def test_degrees_in_every_spelling(table, header, cells, place):
     made = table(f'time,{header}\n1,{cells}\n')
-    (row,) = made
-    assert Degrees(made).place(row) == pytest.approx(place, abs=1e-9)
+    assert Degrees(made).place(next(iter(made))) == pytest.approx(place, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -160,28 +193,9 @@ def test_what_is_no_position_is_a_bad_row(table, header, cells, words):
         Degrees(made).place(row)
 
 
-@pytest.mark.parametrize(
-    'head, cells, place',
-    [
-        ('ew', '33,S,70,O\n33,S,70,W', (-33.0, 70.0)),
-        ('ew', '33,S,70,O\n33,S,70,E', (-33.0, -70.0)),
-        ('O/W', '33,S,70,O', (-33.0, 70.0)),
-        ('E/O', '33,S,70,O', (-33.0, -70.0)),
-    ],
-)
-def test_o_is_east_beside_west_and_west_beside_east(table, head, cells, place):
-    made = table(f'lat,ns,lon,{head}\n{cells}\n')
-    assert Degrees(made).place(next(iter(made))) == place
-
-
 def test_o_alone_is_a_question(table):
     with pytest.raises(BagError, match='may be east .Ost. or west'):
         Degrees(table('lat,ns,lon,ew\n33,S,70,O\n'))
-
-
-def test_a_column_of_s_elsewhere_is_no_hemisphere(table):
-    made = table('lat,lon,foo,mode,bar\n33,70,1,S,2\n33,70,1,N,3\n33,70,1,A,3\n')
-    assert Degrees(made).place(next(iter(made))) == (33.0, 70.0)
 
 
 def test_latitude_and_longitude_exchanged_are_a_question_with_an_answer(table):
@@ -424,11 +438,6 @@ def test_one_column_of_hemispheres_alone_is_a_question(table, header):
         assert Degrees(made).place(next(iter(made))) == (latitude, 70.25)
 
 
-def test_a_diver_named_s_is_no_hemisphere(table):
-    made = table('name,lat,lon,id\nS,33.5,70.25,E\n')
-    assert Degrees(made).place(next(iter(made)))[0] == 33.5
-
-
 @pytest.mark.parametrize(
     'kind, head, cells',
     [
@@ -462,3 +471,67 @@ def test_forms_that_were_found_out_are_said(tmp_path):
     assert notes['stamp of in.csv'] == 'Time is HHMMSS'
     assert notes['date of in.csv'] == 'Date is DMY'
     assert 'DDMM.MM' in notes['degrees']
+
+
+def test_units_in_a_row_below_the_headers(table):
+    made = table('time,x,bearing,depth (ft)\n(min),km,rad,m\n1.5,2,0.5,10\n')
+    (row,) = made
+    assert (row.number('x'), row.number('depth')) == (2000.0, pytest.approx(3.048))
+    assert row.stamp_ns() == 90 * 10**9
+    assert made.with_unit('bearing') == 'bearing [rad]'
+
+
+def test_a_row_of_words_that_are_no_units_is_a_row(table):
+    assert len(list(table('time,x,id\n1,2,km\n'))) == 1
+    assert len(list(table('time,x,status\nnone,none,bad\n1,2,ok\n'))) == 2
+
+
+def test_a_line_that_names_the_delimiter_is_none_of_the_table(table):
+    (row,) = table('sep=;\nZeit;x;y\n1;2,5;3\n')
+    assert row.number('x') == 2.5
+
+
+def test_void_fixes_of_nmea_are_left_out(table):
+    good, bad = table('time,x,y,status\n1,2,3,A\n2,2,3,V\n')
+    good.require_valid()
+    with pytest.raises(BadRow, match='flagged as invalid'):
+        bad.require_valid()
+
+
+def test_n_and_e_over_letters_are_hemispheres(tmp_path):
+    text = 'time,lat,N,lon,E\n1,33.5,S,70.25,W\n2,33.6,S,70.25,W\n'
+    assert converted(tmp_path, text, 'fixes')[1].position[1] == pytest.approx(-11_094, abs=10)
+
+
+def test_an_altitude_beside_a_depth_is_that_over_the_ground(tmp_path):
+    text = 'time,lat,lon,depth,altitude\n1,59.43,10.47,12.5,3.2\n'
+    (fix,) = converted(tmp_path, text, 'fixes')
+    assert fix.position == pytest.approx([0.0, 0.0, -12.5], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    'header, options, x',
+    [
+        ('slant range', [], 40.0),
+        ('Distance oblique (m)', [], 40.0),
+        ('range', ['--ranges', 'slant'], 40.0),
+        ('range', ['--ranges', 'horizontal'], 50.0),
+        ('horizontal range', [], 50.0),
+        ('range', [], None),
+    ],
+)
+def test_ranges_are_slant_or_horizontal_where_the_depth_matters(
+    tmp_path, capsys, header, options, x
+):
+    text = f'time,{header},bearing_deg,depth\n1,50,90,30\n2,50,90,30\n'
+    found = converted(tmp_path, text, 'fixes', '--bearings', 'north', *options)
+    if x is None:
+        assert found == []
+        assert 'say --ranges slant or --ranges horizontal' in capsys.readouterr().err
+    else:
+        assert found[0].position == pytest.approx([x, 0.0, -30.0])
+
+
+def test_a_depth_that_hardly_matters_is_no_question(tmp_path):
+    text = 'time,range,bearing_deg,depth\n1,50,90,3\n2,50,90,3\n'
+    assert converted(tmp_path, text, 'fixes')[0].position[0] == pytest.approx(50.0)

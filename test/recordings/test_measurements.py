@@ -25,19 +25,11 @@ POINT = 'geometry_msgs/msg/PointStamped'
 def ping():
     return write_arrivals(
         Arrivals(
-            stamp_ns=10**18,
-            tx_id=[0],
-            rx_id=[1],
-            tx=[[0.0, 0.0, 0.0]],
-            rx=[[1.0, 0.0, 0.0]],
-            toa=[0.1],
-            var_toa=[np.nan],
-            bearing=[np.nan],
-            var_bearing=[np.nan],
-            frame_id='map',
+            stamp_ns=10**18, tx_id=[0], rx_id=[1], tx=[[0.0, 0.0, 0.0]], rx=[[1.0, 0.0, 0.0]],
+            toa=[0.1], var_toa=[np.nan], bearing=[np.nan], var_bearing=[np.nan], frame_id='map',
         ),
         ros_message,
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@
 """Recordings of drivers whose packages are not installed, of vessels, tags and sensors."""
 
 import json
+import math
 
 from helpers.marine import driver_message, typestore
 import numpy as np
@@ -26,7 +27,13 @@ from sonar_imm_tools.offline.inspection import inspect
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.offline.tracking import InputOptions, OfflineRun, write_run
 from sonar_imm_tools.recordings.messages import ros_message
-from sonar_imm_tools.recordings.positions import GAP_S, Positions, read_positions, write_position
+from sonar_imm_tools.recordings.positions import (
+    GAP_S,
+    Positions,
+    read_navigated,
+    read_positions,
+    write_position,
+)
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.topics import fitting_topics
 
@@ -133,12 +140,9 @@ def test_a_driver_on_any_topic_is_suggested(tmp_path):
 def geo(k, topic='/fix', status=0, x=None, frame_id='gps'):
     place = ORIGIN.geodetic(np.array([0.7 * k if x is None else x, 5.0, 0.0]))
     fix = GeodeticFix(
-        stamp_ns=(START + k) * SECOND,
-        latitude=place[0],
-        longitude=place[1],
-        covariance=0.04 * np.eye(3),
-        frame_id=frame_id,
-    )
+        stamp_ns=(START + k) * SECOND, latitude=place[0], longitude=place[1],
+        covariance=0.04 * np.eye(3), frame_id=frame_id,
+    )  # fmt: skip
     message = write_geodetic(fix, ros_message)
     message.status.status = status
     return fix.stamp_ns, topic, message
@@ -168,11 +172,9 @@ def test_the_gps_of_a_vessel_is_not_taken_for_a_diver(tmp_path):
     def fix(k):
         position = (0.5 * k, 0.1, 0.0)
         item = Fix(
-            stamp_ns=(START + k) * SECOND,
-            position=position,
-            covariance=0.04 * np.eye(2),
+            stamp_ns=(START + k) * SECOND, position=position, covariance=0.04 * np.eye(2),
             frame_id='map',
-        )
+        )  # fmt: skip
         return item.stamp_ns, '/usbl/fix', write_fix(item, ros_message)
 
     records = [fix(k) for k in range(1, 10)] + [geo(k, '/gps/fix') for k in range(1, 10)]
@@ -278,3 +280,20 @@ def test_only_fixes_of_a_receiver_that_has_one_are_places(tmp_path):
         found = read_positions(reader)
     assert found.stamp_ns.tolist() == [START * SECOND, (START + 2) * SECOND]
     assert found.longitude.tolist() == [10.0, 12.0]
+
+
+def test_a_place_of_the_navigation_with_one_coordinate_is_none(tmp_path):
+    records = []
+    for k, (x, y) in enumerate(((1.0, 2.0), (3.0, math.nan), (math.nan, 4.0), (5.0, 6.0))):
+        header = ros_message(
+            'std_msgs/msg/Header',
+            stamp=ros_message('builtin_interfaces/msg/Time', sec=START + k, nanosec=0),
+            frame_id='map',
+        )
+        message = ros_message('nav_msgs/msg/Odometry', header=header)
+        message.pose.pose.position.x, message.pose.pose.position.y = x, y
+        records.append(((START + k) * SECOND, '/nav', message))
+    with BagReader(write_bag(tmp_path / 'bag', records)) as reader:
+        found = read_navigated(reader, lambda places: (places[:, 0], places[:, 1]))
+    assert found.stamp_ns.tolist() == [START * SECOND, (START + 3) * SECOND]
+    assert (found.longitude.tolist(), found.latitude.tolist()) == ([1.0, 5.0], [2.0, 6.0])

@@ -446,6 +446,24 @@ def test_an_index_that_speaks_of_more_messages_is_told(
         assert f'problem: {sentence}' in capsys.readouterr().out
 
 
+@pytest.mark.parametrize('said', ['-5', '1e20'])
+@pytest.mark.parametrize('held', [0, 4])
+def test_an_index_of_impossible_counts_is_told(tmp_path, fix_message, said, held, capsys):
+    """What is there is read, file by file; without anything to track the commands end with 1."""
+    path = tmp_path / 'bag'
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        link = writer.add_connection('/fix', FIX, typestore=typestore())
+        for i in range(held):
+            writer.write(link, 10 + i, typestore().serialize_cdr(fix_message(i), FIX))
+    metadata = path / 'metadata.yaml'
+    text = metadata.read_text()
+    metadata.write_text(text.replace(f'message_count: {held}', f'message_count: {said}'))
+    for words in (['info', str(path)], ['track', str(path), str(tmp_path / 'out')]):
+        assert main(words) == (0 if held else 1)
+        told = f'metadata.yaml has a message count of {said.replace("e", "e+")}'
+        assert told in capsys.readouterr().out
+
+
 def test_statistics_of_a_file_that_speak_of_more_messages_are_told(tmp_path):
     with Writer(tmp_path / 'none', version=8, storage_plugin=StoragePlugin.MCAP) as writer:
         writer.add_connection('/fix', FIX, typestore=typestore())

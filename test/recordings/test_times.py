@@ -11,8 +11,9 @@ from datetime import datetime, timezone
 
 import pytest
 
-from sonar_imm_tools.recordings.csv_table import CsvOptions, CsvTable
+from sonar_imm_tools.recordings.csv_table import CsvTable
 from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.times import BadRow
 
 
@@ -62,6 +63,12 @@ def ns(text):
         ('time,x', ['2016-12-31 23:59:60,1'], '2017-01-01 00:00:00'),
         ('datenum,x', ['737061.75,1'], '2018-01-01 18:00:00'),
         ('excel_time,x', ['43101.75,1'], '2018-01-01 18:00:00'),
+        ('JD,x', ['2458120.25,1'], '2018-01-01 18:00:00'),
+        ('mjd,x', ['58119.75,1'], '2018-01-01 18:00:00'),
+        ('Time (min),x', ['1.5,1'], '1970-01-01 00:01:30'),
+        ('time_h,x', ['9.25,1'], '1970-01-01 09:15:00'),
+        ('Temps [jours],x', ['2.5,1'], '1970-01-03 12:00:00'),
+        ('time,x', ['2025-06-03 09:00:00-03,1'], '2025-06-03 12:00:00'),
     ],
 )  # fmt: skip
 def test_forms_of_dates_and_times(stamps, header, cells, wanted):
@@ -82,7 +89,7 @@ def test_times_of_day_in_one_number_pass_minutes_and_hours(stamps):
     'header, cells, words, options',
     [
         ('Date,Time', ['20210504,10203', '20210504,10204'], 'HHMMSS or seconds',
-         {'HHMMSS': '2021-05-04 01:02:03', 's': '1970-01-01 02:50:03'}),
+         {'HHMMSS': '2021-05-04 01:02:03', 's': '2021-05-04 02:50:03'}),
         ('time,x', ['736950.70795,1', '736950.70796,1', '736950.70797,1'],
          'may count days .datenum. or seconds',
          {'datenum': '2017-09-12 16:59:26.880', 's': '1970-01-09 12:42:30.70795'}),
@@ -156,3 +163,43 @@ def test_a_time_of_day_in_one_number_needs_a_date(stamps):
 def test_counts_of_seconds_stay(stamps, numbers):
     found = stamps('time,x', *(f'{number},1' for number in numbers))
     assert found == [round(number * 1e9) for number in numbers]
+
+
+@pytest.mark.parametrize(
+    'header, wanted',
+    [
+        ('Date Time (GMT+02:00)', '2021-05-04 08:00:00'),
+        ('"Date Time, GMT-05:00"', '2021-05-04 15:00:00'),
+        ('time_utc_+2', '2021-05-04 08:00:00'),
+        ('Zeit (UTC -3)', '2021-05-04 13:00:00'),
+        ('Time [UTC+0530]', '2021-05-04 04:30:00'),
+        ('Time (UTC)', '2021-05-04 10:00:00'),
+    ],
+)
+def test_zones_of_headers(stamps, header, wanted):
+    columns = {'columns': {'stamp': header}} if header.startswith('time_') else {}
+    assert stamps(f'{header},x', '2021-05-04 10:00:00,1', **columns) == [ns(wanted)]
+
+
+@pytest.mark.parametrize(
+    'cells, unit, wanted',
+    [
+        (['2021-05-04,36000.5', '2021-05-04,36001.5'], 's', '2021-05-04 10:00:00.5'),
+        (['04.05.2021,0.4375', '04.05.2021,0.43751'], 'excel', '2021-05-04 10:30:00'),
+    ],
+)
+def test_numbers_beside_a_date_count_from_its_midnight_or_are_asked(stamps, cells, unit, wanted):
+    with pytest.raises(BagError, match=f'--time-unit {unit} or --ignore date'):
+        stamps('Date,Time', *cells, time_zone='UTC')
+    assert stamps('Date,Time', *cells, time_zone='UTC', time_unit=unit)[0] == ns(wanted)
+    later = stamps('Date,Time', *cells, time_zone='+02:00', time_unit=unit)
+    assert later[0] == ns(wanted) - 7200 * 10**9
+    assert stamps('Date,Time', *cells, ignore=['date'])[0] == float(cells[0].split(',')[1]) * 1e9
+
+
+@pytest.mark.parametrize('text', ['2024-10-27 02:30:00', '2024-03-31 02:30:00'])
+def test_times_within_a_clock_change_are_left_out(stamps, text):
+    """One is twice on the clocks of Berlin, the other one never."""
+    with pytest.raises(BadRow, match='twice, or not at all.*--time-zone'):
+        stamps('time,x', f'{text},1', time_zone='Europe/Berlin')
+    assert stamps('time,x', f'{text},1', time_zone='+01:00') == [ns(text) - 3600 * 10**9]

@@ -34,7 +34,7 @@ from sonar_imm_tools.replay import player as player_module
 from sonar_imm_tools.replay.harness import LockstepResult, reserved_domain_id, run_lockstep
 from sonar_imm_tools.replay.link import Link, LinkError
 from sonar_imm_tools.replay.lockstep import Counts
-from sonar_imm_tools.replay.player import NAME, Pace, play, Player, PlayOptions
+from sonar_imm_tools.replay.player import NAME, Pace, Pause, play, Player, PlayOptions
 
 
 @pytest.fixture
@@ -69,12 +69,9 @@ def test_a_stretch_without_a_topic_and_with_another_quality_of_service(bag, link
     ear = Ear(link, PoseWithCovarianceStamped, '/fix')
     text = '/fix:\n  reliability: reliable\n  durability: transient_local\n  depth: 7\n'
     options = PlayOptions(
-        rate=100.0,
-        start_offset=0.05,
-        playback_duration=0.1,
-        exclude_topics=('/other',),
+        rate=100.0, start_offset=0.05, playback_duration=0.1, exclude_topics=('/other',),
         qos=profiles_of(text),
-    )
+    )  # fmt: skip
     with BagReader(bag) as reader, Link(NAME, domain_id=domain) as peer:
         player = Player(reader, peer, options)
         (publisher,) = player._publishers.values()
@@ -137,11 +134,9 @@ def test_a_loop_starts_over_with_the_recorded_stamps(bag, link, domain):
 
     with pytest.raises(Enough):
         play(
-            bag,
-            PlayOptions(loop=True, topics=('/fix',), rate=10.0),
-            domain_id=domain,
+            bag, PlayOptions(loop=True, topics=('/fix',), rate=10.0), domain_id=domain,
             progress=progress,
-        )
+        )  # fmt: skip
     assert ear.positions(COUNT + 4)[COUNT : COUNT + 3] == [0.0, 1.0, 2.0]
 
 
@@ -162,6 +157,16 @@ def test_a_paused_player_waits_for_resume(bag, link, domain):
     thread.join(120.0)
     assert results[0].published == COUNT + 1
     assert len(ear.positions(COUNT)) == COUNT
+
+
+def test_pause_and_resume_are_services(link):
+    pause = Pause(link, paused=False)
+    for name, paused, words in (('pause', True, 'paused'), ('resume', False, 'playing')):
+        client = link.node.create_client(Trigger, f'~/{name}')
+        assert link.wait_for(client.service_is_ready, 120.0)
+        future = client.call_async(Trigger.Request())
+        assert link.wait_for(future.done, 120.0)
+        assert (pause.paused, future.result().message) == (paused, words)
 
 
 @pytest.mark.parametrize(

@@ -21,20 +21,10 @@ from sonar_imm_tools.simulation.survey import budget, pings_of, scenario, simula
 from sonar_imm_tools.survey.line import line_of
 
 EXACT = {
-    'lines': 1,
-    'cross_lines': 0,
-    'length': 60.0,
-    'noise': 0.0,
-    'nav_errors': 0.0,
-    'roll_bias_deg': 0.0,
-    'tide_std': 0.0,
-    'sound_speed_error': 0.0,
-    'outliers': 0.0,
-    'fish': False,
-    'ghost': False,
-    'terrain': 'slope',
-    'slope': 0.1,
-}
+    'lines': 1, 'cross_lines': 0, 'length': 60.0, 'noise': 0.0, 'nav_errors': 0.0,
+    'roll_bias_deg': 0.0, 'tide_std': 0.0, 'sound_speed_error': 0.0, 'outliers': 0.0,
+    'fish': False, 'ghost': False, 'terrain': 'slope', 'slope': 0.1,
+}  # fmt: skip
 
 
 def off_the_floor(scene, line):

@@ -19,16 +19,10 @@ from benchmarks.bounds import CASES, measured
 pytestmark = pytest.mark.system
 
 LIMITS = {
-    'fixes': (2.0, 100.0),
-    'fixes_softly': (10.0, 200.0),
-    'arrivals_wild_tag': (5.0, 50.0),
-    'arrivals_many_divers': (40.0, 50.0),
-    'detections': (2.0, 100.0),
-    'snapshot': (5.0, 100.0),
-    'pressure': (5.0, 500.0),
-    'csdm': (5.0, 200.0),
-    'trace': (5.0, 500.0),
-}
+    'fixes': (2.0, 100.0), 'fixes_softly': (10.0, 200.0), 'arrivals_wild_tag': (5.0, 50.0),
+    'arrivals_many_divers': (40.0, 50.0), 'detections': (2.0, 100.0), 'snapshot': (5.0, 100.0),
+    'pressure': (5.0, 500.0), 'csdm': (5.0, 200.0), 'trace': (5.0, 500.0),
+}  # fmt: skip
 """Seconds of CPU and megabytes of one message."""
 
 

@@ -131,13 +131,6 @@ def test_a_limit_that_is_not_reached_exits_with_1(bags, capsys, name, what):
     assert 'ok    estimates of the node against offline: equal bytes' in printed
 
 
-def test_told_otherwise_than_it_says_a_recording_of_another_array_is_counted_out(tmp_path, capsys):
-    bag = share_folder() / 'bags' / 'fathometer_array'
-    assert main(['track', str(bag), str(tmp_path / 'out'), '--set', 'phones=32', '--json']) == 2
-    assert 'refused: 12 (wrong_hydrophones: ' in capsys.readouterr().err
-    assert not (tmp_path / 'out').exists()
-
-
 def test_detections_kept_in_a_bag_give_the_same_tracks(bags, tmp_path, capsys):
     bag, (kept, first, second) = bags('images'), (tmp_path / n for n in ('kept', 'one', 'two'))
     assert main(['convert', 'images', str(bag), str(kept)]) == 0
@@ -231,17 +224,6 @@ def test_a_mounting_counts_live_and_offline(tmp_path, capsys):
 
 
 # -- what ends ----------------------------------------------------------------------------------
-
-
-def test_lockstep_with_nobody_is_one_line_and_exit_code_1(bags, capsys, monkeypatch):
-    from sonar_imm_tools.replay import player
-
-    bag = bags('diver')
-    capsys.readouterr()
-    monkeypatch.setattr(player, 'MATCH_LIMIT', 0.5)
-    assert main(['play', str(bag), '--lockstep', '/nobody']) == 1
-    error = capsys.readouterr().err
-    assert len(error.splitlines()) == 1 and "no answer from a node '/nobody'" in error
 
 
 def children(pid):

@@ -18,6 +18,7 @@ say themselves.
 import math
 
 from attrs import evolve
+from helpers.diver_runs import arrivals
 from helpers.faults.figures import Figures
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ import pytest
 from msg_adapters.displays.obstacle import write_markers, write_poses
 from msg_adapters.estimates import read_estimate, write_estimate
 from msg_adapters.soundings import read_soundings, write_soundings
-from sonar_imm.measurements import Arrivals, Detections, Fix, Fixes, Navigation, Snapshot, Trace
+from sonar_imm.measurements import Detections, Fix, Fixes, Navigation, Snapshot, Trace
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.recordings.messages import ros_message
@@ -114,13 +115,15 @@ def divers(motion, order=(0, 1), receivers=(0, 1, 2, 3)):
             legs = np.linalg.norm(RX[:, None] - at, axis=2)
             toa = (legs + legs[0])[:, list(order)] / 1500.0
             rx = motion.point(RX)[list(receivers)]
-            n = 4 * len(at)
-            found.append(Arrivals(
-                stamp_ns=stamp, frame_id='map', tx_id=np.zeros(n), tx=np.tile(motion.point(RX[0]),
-                (n, 1)), rx_id=np.repeat(receivers, 2), rx=np.repeat(rx, 2, axis=0),
-                toa=toa[list(receivers)].ravel(), var_toa=np.full(n, 1e-8),
-                bearing=np.full(n, np.nan), var_bearing=np.full(n, np.nan),
-            ))  # fmt: skip
+            found.append(
+                arrivals(
+                    stamp,
+                    np.repeat(rx, 2, axis=0),
+                    toa[list(receivers)].ravel(),
+                    rx_id=np.repeat(receivers, 2),
+                    tx=motion.point(RX[0]),
+                )
+            )
             continue
         R = np.tile(motion.covariance(np.array([[0.2, 0.05], [0.05, 0.1]])), (2, 1, 1))
         moved = motion.point(at)[list(order)]

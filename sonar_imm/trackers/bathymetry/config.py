@@ -29,29 +29,24 @@ from .terrain import KINDS
 DEFAULT_SIGMAS = {
     'height_rw_ncs': (0.5, 1.0),
     'height_two_rw': (0.01, 0.5),
-    'height_bank': (0.003, 0.03, 0.07, 0.5),
-    'scatter_bank': (0.01, 0.01, 0.02, 0.05, 0.1),
 }
-"""Noise of each model a range bin: metres, but 1/m for the slope model `ncs`; of `scatter_bank`
-the rough ones alone."""
-DEFAULT_SCATTERS = (0.2, 0.5, 0.0, 0.0, 0.0)
-"""`scatter_bank`: standard deviation of the bins of each rough model about its base, m."""
-DEFAULT_STAY, BANK_STAY = 0.995, 0.998
+"""Noise of each model a range bin: metres, but 1/m for the slope model `ncs`."""
+DEFAULT_STAY = 0.995
 DEFAULT_SIGMAS_DEG = (0.1, 0.1, 2.0)
-BANKS = ('height_bank', 'scatter_bank')
-SCALAR_SETS = ('height_two_rw', 'angle_two_rw', *BANKS)
+SCALAR_SETS = ('height_two_rw', 'angle_two_rw')
 MODEL_SETS = ('terrain', 'height_rw_ncs', *SCALAR_SETS)
 """`SCALAR_SETS`: those of one state, which the grid engine can run."""
 SPEED_STD, SPEED_STD_OF_NONE = 2.0, 15.0
 """m/s, of a sound speed that a snapshot states, and of one that nobody does."""
 BEND_STD = 0.5
 """m/s, of the mean sound speed below the array: what bends a ray."""
+USUAL_ALARM, HIGHEST_ALARM = 1e-3, 0.5
+"""`gate_false_alarm`, and the highest one of a test."""
 STEEP_DEG = 60.0
 """An array that looks down by so much runs angle models."""
 OF_OTHER_SETS = (
     'sigmas',
     'sigmas_deg',
-    'scatters',
     'transition_matrix',
     'stay_probability',
     'initial_probabilities',
@@ -74,8 +69,7 @@ class BathymetryConfig(MountingParameters):
         choices=MODEL_SETS)
     sigmas: tuple[float, ...] = live((), '',
         'process noise of each model over a range bin, in the order of model_set: m, but 1/m for '
-        'ncs; empty: values that suit most floors; height_bank takes any number of values, '
-        'scatter_bank those of its rough models',
+        'ncs; empty: values that suit most floors',
         range=(0.0, 1000.0), kind='float[]')
     sigmas_deg: tuple[float, ...] = live((), 'deg',
         'angle_two_rw: process noise of the first model over a range bin, then of the second at '
@@ -84,13 +78,6 @@ class BathymetryConfig(MountingParameters):
     sigma_reference_bin: float = constant(0.0, 'm',
         'range bin for which sigmas and sigmas_deg are stated: they grow with sqrt(bin / '
         'reference); 0: as stated, whatever the bin', range=(0.0, 100.0))
-    rough_sigma: float = constant(0.07, 'm',
-        'height_bank: random walks with at least this noise over a range bin are rough floor; '
-        'undulations and slopes of a smooth floor need up to 0.05', range=(0.0, 1000.0))
-    scatters: tuple[float, ...] = constant((), 'm',
-        'scatter_bank: standard deviation of single bins about the walk of each rough model, in '
-        'the order of sigmas; empty: values that suit most floors', range=(0.0, 100.0),
-        kind='float[]')
     rough_std: float = live(0.3, 'm',
         'floor is labelled smooth (told 0) only where roughness of this standard deviation would '
         'be seen; smooth means less than that', range=(0.0, 1000.0))
@@ -99,15 +86,14 @@ class BathymetryConfig(MountingParameters):
         range=(0.0, 1.0), kind='float[]')
     stay_probability: float = live(0.0, '',
         'probability of keeping the model over a range bin, used without transition_matrix; 0: '
-        '0.995, or 0.998 in height_bank and scatter_bank (of its smooth models, whose slopes '
-        'change besides)', range=(0.0, 1.0))
+        '0.995', range=(0.0, 1.0))
     initial_probabilities: tuple[float, ...] = live((), '',
         'model probabilities before the first bin; empty: uniform', range=(0.0, 1.0),
         kind='float[]')
-    initial_mean: float = live(0.0, '',
+    initial_mean: float = constant(0.0, '',
         'state before the first bin: height of the floor in m, or angle in rad (see initial_std)',
         range=(-1000.0, 1000.0))
-    initial_std: float = live(0.0, '',
+    initial_std: float = constant(0.0, '',
         'standard deviation of the state before the first bin, m or rad; 0: 1 m, or 5 deg around '
         'the angle of the first echo of the reference floor', range=(0.0, 1000.0))
     initial_slope_std: float = constant(0.1, '',
@@ -148,11 +134,10 @@ class BathymetryConfig(MountingParameters):
     noise_variance: float = live(0.0, '',
         'noise power at a stave, for snapshots that do not state it; 0: estimated from the water '
         'column, or blindly where there is none', range=(0.0, 1e30))
-    shadow_gate: bool = live(True, '',
-        'bridge bins without a coherent echo with the smoothest model')
-    gate_false_alarm: float = live(1e-3, '',
-        'probability that the test for a coherent echo (shadow_gate) takes noise for an echo',
-        range=(1e-9, 0.5))
+    gate_false_alarm: float = live(USUAL_ALARM, '',
+        'probability that the test for a coherent echo takes noise for one, at most 0.5; bins '
+        'without an echo are bridged with the smoothest model; 1: no test, every bin is an echo',
+        range=(1e-9, 1.0))
     decorrelation: float = live(0.0, '',
         'share of the power of an echo that differs from stave to stave, as from a diffuse floor '
         'under a wide aperture; it acts as noise', range=(0.0, 0.95))
@@ -171,21 +156,20 @@ class BathymetryConfig(MountingParameters):
     # -- computation -----------------------------------------------------------------------------
     engine: str = live('auto', '',
         'gaussian (for terrain alone), particles, or grid (exact, without Monte Carlo noise, for '
-        'sets of one state); auto: gaussian for terrain, grid for height_bank and scatter_bank, '
-        'else particles', choices=('auto', 'gaussian', 'particles', 'grid'))
+        'sets of one state); auto: gaussian for terrain, else particles',
+        choices=('auto', 'gaussian', 'particles', 'grid'))
     particles_per_model: int = live(100, '',
         'number of particles of each model', range=(2, 100_000))
     grid_step: float = constant(0.0, '',
         'distance between grid points, m or rad; 0: the smallest noise, at most 0.01 m or 0.05 '
-        'deg; 0.01 m for height_bank, 0.02 m for scatter_bank', range=(0.0, 100.0))
+        'deg', range=(0.0, 100.0))
     grid_extent: float = constant(20.0, 'm',
         'distance that a grid of heights reaches to both sides of the start, at least 2 '
         'sonar_height_std; a grid of angles holds all that are possible', range=(0.1, 1000.0))
     smoothing: str = live('auto', '',
         'use of the whole ping for each bin: none, modes (Kim: the model probabilities only) or '
         'states (outward and inward, everything: terrain and the grid); auto: states for terrain, '
-        'and for height_bank and scatter_bank on the grid, which find little without, else none',
-        choices=('auto', 'none', 'modes', 'states'))
+        'else none', choices=('auto', 'none', 'modes', 'states'))
     ping_coupling: float = live(0.0, '',
         'strength with which the model labels of neighbouring pings influence each other; 0: not '
         'at all, 0.15 to 0.35 suit most; needs smoothing; estimates come one ping late, heights '
@@ -220,7 +204,7 @@ class BathymetryConfig(MountingParameters):
     # -- how well it is known --------------------------------------------------------------------
     sonar_height_std: float = live(0.0, 'm',
         'standard deviation of sonar_height; the filter then starts at the first return; 0: '
-        'sonar_height is exact, see initial_std', range=(0.0, 1000.0))
+        'sonar_height is exact', range=(0.0, 1000.0))
     attitude_std_deg: float = live(0.05, 'deg',
         'standard deviation of roll and pitch in nav', range=(0.0, 45.0))
     heading_std_deg: float = live(0.1, 'deg',
@@ -240,17 +224,15 @@ class BathymetryConfig(MountingParameters):
 
     def check(self) -> list[str]:
         problems = super().check() + self._ship_problems() + self._check_sigmas()
-        models = self.model_count()
         if self.is_terrain:
             problems += self._terrain_problems()
-        elif self.model_set == 'scatter_bank':
-            problems += self._scatter_problems()
         else:
             problems += chain_problems(
-                self.transition_matrix, self.initial_probabilities, models, self.model_set
+                self.transition_matrix,
+                self.initial_probabilities,
+                self.model_count(),
+                self.model_set,
             )
-            if self.scatters:
-                problems.append('scatters is for scatter_bank only')
         if self.engine == 'gaussian' and not self.is_terrain:
             problems.append('engine gaussian is for model_set terrain only')
         if self.runs_on_grid and self.model_set not in (*SCALAR_SETS, 'terrain'):
@@ -268,15 +250,16 @@ class BathymetryConfig(MountingParameters):
                 'ping_coupling needs what a whole ping says of each bin: smoothing states (model '
                 'set terrain, or engine grid) or modes'
             )
-        if self.model_set == 'angle_two_rw' and abs(self.initial_mean) > 0.5 * math.pi:
-            problems.append(
-                f'initial_mean is an angle for angle_two_rw, between -pi/2 and pi/2, not '
-                f'{self.initial_mean:g}'
-            )
         return problems
 
     def _ship_problems(self) -> list[str]:
-        problems = [
+        problems = []
+        if HIGHEST_ALARM < self.gate_false_alarm < 1.0:
+            problems.append(
+                f'gate_false_alarm is at most {HIGHEST_ALARM}, or 1 for no test, not '
+                f'{self.gate_false_alarm:g}'
+            )
+        problems += [
             f'{name} needs three values, got {len(getattr(self, name))}'
             for name in ('sonar_lever', 'sonar_mount_rpy_deg')
             if len(getattr(self, name)) != 3
@@ -304,24 +287,6 @@ class BathymetryConfig(MountingParameters):
             problems.append('terrain smooths states, or nothing (none)')
         return problems
 
-    def _scatter_problems(self) -> list[str]:
-        problems = []
-        if self.transition_matrix or self.initial_probabilities:
-            problems.append(
-                'scatter_bank has a chain of its own: it takes stay_probability, neither '
-                'transition_matrix nor initial_probabilities'
-            )
-        if len(self.scatters_used) != len(self.sigmas_used):
-            problems.append(
-                f'scatter_bank needs a scatter for each of its {len(self.sigmas_used)} sigmas, '
-                f'got {len(self.scatters_used)}'
-            )
-        if not self.runs_on_grid:
-            problems.append('scatter_bank needs engine grid')
-        if self.smoothing == 'modes':
-            problems.append('scatter_bank smooths states, or nothing (none)')
-        return problems
-
     def _check_sigmas(self) -> list[str]:
         if self.is_terrain:
             return []
@@ -335,12 +300,7 @@ class BathymetryConfig(MountingParameters):
             return problems
         problems = ['sigmas_deg is for angle_two_rw only'] if self.sigmas_deg else []
         wanted = len(DEFAULT_SIGMAS[self.model_set])
-        if self.in_bank:
-            if len(self.sigmas) > 16:
-                problems.append(
-                    f'{self.model_set} takes at most 16 sigmas, got {len(self.sigmas)}'
-                )
-        elif len(self.sigmas) not in (0, wanted):
+        if len(self.sigmas) not in (0, wanted):
             problems.append(
                 f'sigmas needs {wanted} values for model_set {self.model_set}, got '
                 f'{len(self.sigmas)}'
@@ -372,6 +332,16 @@ class BathymetryConfig(MountingParameters):
         return GeometryDoubt(math.radians(self.tilt_std_deg), self.spacing_std, std / speed)
 
     @property
+    def is_gated(self) -> bool:
+        """Whether bins are tested for an echo."""
+        return self.gate_false_alarm < 1.0
+
+    @property
+    def false_alarm(self) -> float:
+        """Of the test for an echo. The first one of a ping is looked for without the gate, too."""
+        return self.gate_false_alarm if self.is_gated else USUAL_ALARM
+
+    @property
     def looks_down(self) -> bool:
         """Whether the array looks down so steeply that heights say too little of directions."""
         return abs(self.tilt_deg) >= STEEP_DEG
@@ -395,7 +365,7 @@ class BathymetryConfig(MountingParameters):
     @property
     def runs_on_grid(self) -> bool:
         """Whether the engine is the grid."""
-        return self.engine == 'grid' or (self.engine == 'auto' and self.in_bank)
+        return self.engine == 'grid'
 
     @property
     def is_terrain(self) -> bool:
@@ -407,13 +377,12 @@ class BathymetryConfig(MountingParameters):
         """``none``, ``modes`` or ``states``."""
         if self.smoothing != 'auto':
             return self.smoothing
-        whole = self.is_terrain or (self.in_bank and self.runs_on_grid)
-        return 'states' if whole else 'none'
+        return 'states' if self.is_terrain else 'none'
 
     @property
     def stay_used(self) -> float:
         """Probability of keeping the model over a range bin."""
-        return self.stay_probability or (BANK_STAY if self.in_bank else DEFAULT_STAY)
+        return self.stay_probability or DEFAULT_STAY
 
     @property
     def sigmas_used(self) -> tuple[float, ...]:
@@ -421,25 +390,11 @@ class BathymetryConfig(MountingParameters):
         return self.sigmas or DEFAULT_SIGMAS[self.model_set]
 
     @property
-    def scatters_used(self) -> tuple[float, ...]:
-        """Scatter of each rough model of `scatter_bank`, m."""
-        return self.scatters or DEFAULT_SCATTERS
-
-    @property
     def layover_used(self) -> str:
         """``ignored``, ``gated`` or ``resolved``. An echo by way of the surface is a second
         surface in every bin, which says nothing of the floor."""
         return 'ignored' if self.multipath else self.layover
 
-    @property
-    def in_bank(self) -> bool:
-        return self.model_set in BANKS
-
     def model_count(self) -> int:
         """Number of models in the set these parameters describe."""
-        if self.model_set == 'angle_two_rw':
-            return 2
-        if self.is_terrain:
-            return len(KINDS)
-        smooth = 2 if self.model_set == 'scatter_bank' else 0
-        return smooth + len(self.sigmas_used)
+        return len(KINDS) if self.is_terrain else 2

@@ -90,7 +90,6 @@ def with_open_start(config: BathymetryConfig) -> BathymetryConfig:
         layover='ignored',
         sigmas=(),
         sigmas_deg=(),
-        scatters=(),
         transition_matrix=(),
         stay_probability=0.0,
         initial_probabilities=(),

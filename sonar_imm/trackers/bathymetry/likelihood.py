@@ -353,7 +353,7 @@ def _first_return(
 ) -> int:
     """The first bin with an echo of the floor. Few staves need a stated noise to tell it from one
     bin."""
-    P, false_alarm = staves.count, config.gate_false_alarm
+    P, false_alarm = staves.count, config.false_alarm
     noise = stated_noise(snapshot, config) * staves.level
     if P < coherence.FEWEST_STAVES_ALONE and np.isfinite(noise).all():
         ratio = staves.power(iq) / noise
@@ -402,7 +402,7 @@ def _in_white_noise(
     above_noise = power / noise
     signal, noise = _split(_signal(snapshot, power, noise, np.ones(T)), noise, config)
     gamma, sine = np.ones(T), np.full(T, np.nan)
-    if config.shadow_gate or config.is_terrain:
+    if config.is_gated or config.is_terrain:
         gamma, sine = coherence.coherence(iq, abs(spacing), weights=weights)
     return _Parts(
         form=laplace.form_coefficients(iq, signal, noise, weights),
@@ -463,9 +463,9 @@ def _echoes(
     """Bins (T,) with an echo. Many staves tell it by coherence, and by power where a whole stretch
     cannot be noise; few staves by power alone, where the noise is `known` (T,), since noise is
     coherent at two of them too often."""
-    if not config.shadow_gate:
+    if not config.is_gated:
         return np.array(usable)
-    false_alarm = config.gate_false_alarm
+    false_alarm = config.false_alarm
     silent = coherence.silent_bins(
         parts.coherence, staves, spacing=spacing, false_alarm=false_alarm
     )

@@ -15,11 +15,6 @@ terrain
     Nine kinds of floor, smooth ones with slopes, rough ones whose bins scatter, see `terrain`.
 height_two_rw
     The height h of the floor is a random walk, slow (smooth floor) or fast (rough floor).
-height_bank
-    The same with as many walks as there are sigmas.
-scatter_bank
-    Smooth floor has a slope, `steady` or `undulating`; rough floor is a walk, or bins that
-    scatter about one, see `scatter`.
 height_rw_ncs
     State (h, b), b the slope dh/dr over slant range. `rw`: h is a random walk and b means
     nothing; it is drawn anew from N(0, redrawn_slope_std^2), so that a slope model that takes over
@@ -46,11 +41,10 @@ from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.markov import check_transition_matrix, persistent
 from .config import BathymetryConfig, DEFAULT_SIGMAS_DEG
 from .grid_kernels import Geometry
-from .scatter import bank_of, Scatter
-from .terrain import Terrain, terrain_of
+from .terrain import EITHER, Terrain, terrain_of
 
 HEIGHT_STD, ANGLE_STD = 1.0, math.radians(5.0)
-HEIGHT_STEP, ANGLE_STEP, SCATTER_STEP = 0.01, math.radians(0.05), 0.02
+HEIGHT_STEP, ANGLE_STEP = 0.01, math.radians(0.05)
 FIRST_RETURN_ERROR = 0.25
 """Metres by which the first return may be found too early."""
 MOST_CELLS = 20_000
@@ -103,8 +97,7 @@ class TerrainModels:
     floor. start: the law of the first state where it is no normal one. favour (T, M): factors on
     the predicted probability of each model in each bin, from elsewhere; (0, M) for none.
 
-    With `scatter` several models are one entry of `names`, `rough`, `favour` and the answers. With
-    `terrain` motions are there: F, G and scale say nothing.
+    With `terrain` motions are there: F, G and scale say nothing.
     """
 
     names: tuple[str, ...]
@@ -120,8 +113,12 @@ class TerrainModels:
     rough: BoolArray
     start: UnknownHeight | None = None
     favour: FloatArray = field(factory=lambda: np.empty((0, 0)))
-    scatter: Scatter | None = None
     terrain: Terrain | None = None
+
+    @property
+    def either(self) -> BoolArray:
+        """Models (M,) of floor that may be smooth or rough."""
+        return np.array([self.terrain is not None and name == EITHER for name in self.names])
 
     @property
     def least_variance(self) -> FloatArray:
@@ -187,24 +184,6 @@ def build_models(
             start=start,
             terrain=terrain,
         )
-    if config.model_set == 'scatter_bank':
-        bank = bank_of(config.sigmas_used, config.scatters_used, config.stay_used)
-        M = len(bank.sigma)
-        return TerrainModels(
-            names=bank.names,
-            state_names=_states(config),
-            F=np.ones((M, 1, 1)),
-            G=np.ones((M, 1, 1)),
-            scale=np.tile(_growth(config, ranges) * bank.sigma, (T, 1)),
-            transition=bank.transition,
-            initial=bank.initial,
-            mean=np.array([mean]),
-            std=np.array([std]),
-            coast=bank.coast,
-            rough=bank.rough,
-            start=start,
-            scatter=Scatter(bank.kind, bank.spread, bank.lean * _bin_width(ranges)),
-        )
     M, slope_set = config.model_count(), config.model_set == 'height_rw_ncs'
     if slope_set:
         F, G = _slope_motions(config, ranges)
@@ -213,7 +192,7 @@ def build_models(
         F, G = np.ones((M, 1, 1)), np.ones((M, 1, 1))
         scale = _noises(config, ranges)
     return TerrainModels(
-        names=_names(config, M),
+        names=('rw', 'ncs') if slope_set else ('rw_smooth', 'rw_rough'),
         state_names=_states(config),
         F=F,
         G=G,
@@ -223,29 +202,15 @@ def build_models(
         mean=np.array([mean, 0.0][: F.shape[1]]),
         std=np.array([std, config.initial_slope_std][: F.shape[1]]),
         coast=1 if slope_set else int(np.argmin(scale.sum(axis=0))),
-        rough=_rough(config, M),
+        rough=np.arange(M) == (0 if slope_set else 1),
         start=start,
     )
-
-
-def _names(config: BathymetryConfig, models: int) -> tuple[str, ...]:
-    if config.model_set == 'height_rw_ncs':
-        return 'rw', 'ncs'
-    if config.model_set == 'height_bank':
-        return tuple(f'rw_{number}' for number in range(1, models + 1))
-    return 'rw_smooth', 'rw_rough'
 
 
 def _states(config: BathymetryConfig) -> tuple[str, ...]:
     if config.model_set == 'height_rw_ncs':
         return 'height', 'slope'
     return ('angle',) if config.model_set == 'angle_two_rw' else ('height',)
-
-
-def _rough(config: BathymetryConfig, models: int) -> BoolArray:
-    if not config.in_bank:
-        return np.arange(models) == (0 if config.model_set == 'height_rw_ncs' else 1)
-    return np.array(config.sigmas_used) >= config.rough_sigma
 
 
 def _bin_width(ranges: FloatArray) -> float:
@@ -327,10 +292,7 @@ def grid_cells(config: BathymetryConfig, models: TerrainModels) -> FloatArray:
     if not step > 0.0:
         noises = models.scale[models.scale > 0.0]
         finest = ANGLE_STEP if angle else HEIGHT_STEP
-        if models.scatter is not None:
-            finest = SCATTER_STEP
-        # The smallest walk of a bank is far below what an echo tells: no need to resolve it.
-        step = finest if config.in_bank else min(noises.min(initial=np.inf), finest)
+        step = min(noises.min(initial=np.inf), finest)
     extent = math.pi if angle else max(config.grid_extent, 2.0 * config.sonar_height_std)
     count = math.ceil(min(extent / step, MOST_CELLS))
     cells = models.mean[0] + extent * np.arange(-count, count + 1) / count

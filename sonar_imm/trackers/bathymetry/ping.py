@@ -43,13 +43,10 @@ from .filter_kernels import filter_block, normals
 from .findings import LoudBins, residual_ratio
 from .grid_kernels import (
     filter_ping,
-    filter_scatter,
     GridMotion,
     Particles,
     PingLikelihood,
-    ScatterMotion,
     smooth_ping,
-    smooth_scatter,
     Track,
 )
 from .likelihood import (
@@ -299,23 +296,15 @@ def run_grid(
 ) -> Track:
     """The exact filter along a ping for models of one state, on `cells` (G,), evenly spaced; with
     `smooth` the exact smoother."""
-    T, scatter = len(models.scale), models.scatter
+    T = len(models.scale)
     track = _empty(T, len(models.names), 1)
     track.sample_size[:] = np.nan
     shape = models.density(cells)
     p = models.initial[:, None] * (shape / shape.sum())
     step = cells[1] - cells[0]
-    favour = models.favour
-    if scatter is not None and len(favour):
-        favour = np.ascontiguousarray(favour[:, scatter.kind])
-    motion = GridMotion(cells, models.transition, models.scale / step, models.coast, favour)
+    scale, favour = models.scale / step, models.favour
+    motion = GridMotion(cells, models.transition, scale, models.coast, favour)
     window = np.empty((T, 2), np.int64)
-    if scatter is not None:
-        moves = ScatterMotion(motion, scatter.kind, scatter.spread / step, scatter.lean / step)
-        kept = filter_scatter(p, moves, ping, window, track, smooth)
-        if smooth:
-            smooth_scatter(kept, window, moves, ping, track)
-        return _with_constants(track, ping)
     kept = filter_ping(p, motion, ping, window, track, smooth)
     if smooth:
         smooth_ping(kept, window, motion, ping, track)
@@ -460,7 +449,7 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         'label_probability': track.probability[np.arange(len(label)), label],
         **_label_columns(seen, track, floor),
     }
-    if config.in_bank or config.is_terrain:
+    if config.is_terrain:
         extras['rough'] = np.minimum(track.probability[:, models.rough].sum(axis=1), 1.0)
     extras |= second
     doubtful = seen.doubt
@@ -507,10 +496,13 @@ def _label_columns(seen: Look, track: Track, floor: Floor) -> dict[str, np.ndarr
     """Columns (T,): how sure smooth or rough is, which of them or neither, and the standard
     deviation that roughness needs to be seen."""
     swath, ping = seen.swath, seen.likelihood
-    rough = np.minimum(track.probability[:, seen.models.rough].sum(axis=1), 1.0)
+    rough, either = (
+        np.minimum(track.probability[:, which].sum(axis=1), 1.0)
+        for which in (seen.models.rough, seen.models.rough | seen.models.either)
+    )
     snr = ping.signal / ping.noise
     detectable = DETECTABLE * swath.snapshot_std(floor.angle, snr, seen.staves.count)
-    kind = verdict(rough, detectable, seen.config.rough_std)
+    kind = verdict(rough, either, detectable, seen.config.rough_std)
     kind[~ping.echo] = CANNOT_TELL
     return {
         'label_confidence': np.maximum(rough, 1.0 - rough).astype(np.float32),
@@ -519,11 +511,14 @@ def _label_columns(seen: Look, track: Track, floor: Floor) -> dict[str, np.ndarr
     }
 
 
-def verdict(rough: FloatArray, detectable: FloatArray, rough_std: float) -> np.ndarray:
-    """Smooth, rough or cannot tell (n,), from the probability of rough floor (n,) and the standard
-    deviation (n,) that roughness needs to be seen, m, NaN where unknown. Floor is smooth only
-    where roughness of `rough_std` would be seen: smooth means less than that."""
-    smooth = (rough < 1.0 - SURE) & (detectable <= rough_std)
+def verdict(
+    rough: FloatArray, either: FloatArray, detectable: FloatArray, rough_std: float
+) -> np.ndarray:
+    """Smooth, rough or cannot tell (n,), from the probabilities (n,) of rough floor and of floor
+    that is rough or may be, and the standard deviation (n,) that roughness needs to be seen, m,
+    NaN where unknown. Floor is smooth only where roughness of `rough_std` would be seen: smooth
+    means less than that."""
+    smooth = (either < 1.0 - SURE) & (detectable <= rough_std)
     kind = np.where(rough > SURE, ROUGH, np.where(smooth, SMOOTH, CANNOT_TELL))
     return kind.astype(np.uint8)
 

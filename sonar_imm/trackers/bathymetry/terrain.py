@@ -70,6 +70,10 @@ KINDS = (
     Kind('break', False, 1.0, ANEW, 0.0, 0.1, 0.001),
 )
 
+EITHER = 'winding'
+"""The kind of smooth floor that roughness correlated over metres is, too: a wave of 1 m over 13 m
+has the slopes and bends of roughness of .5 m over 1.5 m."""
+
 
 class Terrain(NamedTuple):
     """The models for bins of one width, m: names and rough (M,); walk (M,) m; phi (M,) of the

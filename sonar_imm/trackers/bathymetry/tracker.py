@@ -219,8 +219,8 @@ class BathymetryTracker:
             sentences.append(
                 f'{silent:.0%} of the bins that stand 20 dB above the quiet ones were passed '
                 'over, since their staves do not agree: state noise_variance, so that power can '
-                'tell echo from noise, check element_spacing_wavelengths, or say shadow_gate: '
-                'false'
+                'tell echo from noise, check element_spacing_wavelengths, or set '
+                'gate_false_alarm: 1'
             )
         if differ > SOME_DECORRELATION + 2.0 * configured:
             sentences.append(

@@ -105,9 +105,10 @@ def resolve_links(known: Known, begun: Mapping[int, int]) -> Known:
 
 
 def update_links(known: Known, _: Scan) -> Known:
-    """End rows whose linked track is confirmed, and rows of long bursts. A stage of the tracker.
+    """End rows whose linked track is confirmed or has ended, and rows of long bursts.
 
-    A row whose linked track has ended is linked to none (-1).
+    A row without its link would take the fixes of a target that appears where the burst is. A
+    stage of the tracker.
     """
     rows = known.rows
     if not rows.tail or not (rows.key['link'] != 0).any():
@@ -115,8 +116,6 @@ def update_links(known: Known, _: Scan) -> Known:
     key = rows.key
     status = dict(zip(known.life.track_id.tolist(), known.life.status.tolist()))
     state = np.array([status.get(each, -1) for each in key['link'].tolist()])
-    link = np.where((key['link'] > 0) & (state < 0), -1, key['link'])
-    rows = rows.replace(key={**key, 'link': link})
     wrong = (key['link'] > 0) & (state > TENTATIVE)
     if wrong.any():
         kept = np.where(wrong, -np.inf, rows.logw)
@@ -129,6 +128,7 @@ def update_links(known: Known, _: Scan) -> Known:
     long = (rows.key['link'] != 0) & (
         rows.key['fixes'] >= np.minimum(LONGEST_BURST, rows.key['taken'])
     )
+    long |= np.isin(rows.key['link'], key['link'][(key['link'] > 0) & (state < 0)])
     return known.replace(rows=end_rows(rows, long))
 
 

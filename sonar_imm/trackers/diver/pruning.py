@@ -185,7 +185,9 @@ def update_status(
     was, existence = known.life.status != TENTATIVE, known['existence']
     likely = links.existence_beside_bursts(known) > CONFIRM_EXISTENCE
     confirmed = was | likely & (known['evidence'] >= CONFIRM_EVIDENCE)
-    alive = ~(existence < known['least_existence'])
+    # Without the track that a burst excludes, the burst would take the fixes of a new target.
+    linked = np.isin(known.life.track_id, known.rows.key['link'])
+    alive = linked | ~(existence < known['least_existence'])
     status = track_status(known.life.status, confirmed, hit, looked)
     if not looked.any():
         return StatusUpdate(status, alive, known['near_to'], known['near_for'])

@@ -55,6 +55,10 @@ DRIFTS, TURNED, LATE = 0.03, np.radians(1.0), 0.1
 """m/s, rad and s from which an error matters."""
 SLOWEST = 0.2
 """m/s below which a course tells nothing of the heading."""
+BEYOND = 3.0
+"""Standard deviations beforehand, beyond which an error is larger than a filter that believes them
+can allow for."""
+UNSAFE = 'heights and behaviours may be wrong by more than stated'
 
 
 class NavigationErrors(NamedTuple):
@@ -104,10 +108,18 @@ class NavigationErrors(NamedTuple):
             'nav_delay': tau,
         }
 
-    def warnings(self, course: FloatArray, obstacles: int) -> list[str]:
+    def warnings(
+        self, course: FloatArray, obstacles: int, config: ObstacleConfig, late: bool = False
+    ) -> list[str]:
         """Return a sentence for each error that is sure and matters; course (3,): velocity of the
-        vehicle, NED; obstacles: number of those that show it."""
+        vehicle, NED; obstacles: number of those that show it; late: whether poses seem to come
+        later than the filter can find."""
         sentences = []
+
+        def verdict(error: float, parameter: str, std: float) -> str:
+            held = abs(error) <= BEYOND * std
+            return 'allowed for' if held else f'{parameter} does not hold it, so {UNSAFE}'
+
         speed = float(np.hypot(*course[:2]))
         if speed >= SLOWEST:
             along = np.array([0.0, 0.0, *course[:2] / speed, 0.0])
@@ -119,8 +131,9 @@ class NavigationErrors(NamedTuple):
                 sentences.append(
                     f'navigation drifts by {abs(drift):.2f} m/s against what {obstacles} '
                     f'{"obstacles show" if obstacles > 1 else "obstacle shows"} ({east:.2f} m/s '
-                    f'east, {north:.2f} m/s north): allowed for; check the log or the current'
-                    f'{alone}'
+                    f'east, {north:.2f} m/s north): '
+                    f'{verdict(drift, "drift_std", config.drift_std)}; check the log or the '
+                    f'current{alone}'
                 )
             aside = self._significant(across)
             if abs(aside) > TURNED * speed:
@@ -132,9 +145,10 @@ class NavigationErrors(NamedTuple):
                 )
         tau = self._significant(np.array([0.0, 0.0, 0.0, 0.0, 1.0]))
         if abs(tau) > LATE:
+            std = 0.0 if late else config.navigation_delay_std
             sentences.append(
-                f'poses arrive {abs(tau):.2f} s {"late" if tau > 0.0 else "early"}: allowed for; '
-                'check the stamps of nav'
+                f'poses arrive {abs(tau):.2f} s {"late" if tau > 0.0 else "early"}: '
+                f'{verdict(tau, "navigation_delay_std", std)}; check the stamps of nav'
             )
         return sentences
 

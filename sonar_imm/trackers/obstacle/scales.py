@@ -29,6 +29,7 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from .config import ObstacleConfig
+from .navigation_errors import UNSAFE
 
 PRIOR, MEMORY = 10.0, 200.0
 SURE, FARTHEST = 0.9, 16.0
@@ -102,17 +103,30 @@ class Scales(NamedTuple):
         keep = math.exp(-len(error) / MEMORY)
         return Scales(*(keep * old + each.sum(axis=0) for old, each in zip(self, new)))
 
-    def warnings(self, config: ObstacleConfig) -> list[str]:
-        """Return a sentence where detections scatter more or less than stated."""
+    def noticed(self, config: ObstacleConfig) -> FloatArray:
+        """Return the factors (2,) of the standard deviations of range and bearing, 1 where they
+        are not sure or do not matter."""
+        factor = np.sqrt(self.factor(config))
+        off = np.abs(np.log(factor))
+        sure = 2.0 * off * np.sqrt(PRIOR + 0.5 * self.number) >= 3.0
+        return np.where(sure & (off >= math.log(MATTERS)) & self.are_learnt, factor, 1.0)
+
+    def warnings(self, config: ObstacleConfig, late: bool = False) -> list[str]:
+        """Return a sentence where detections scatter more or less than stated; late: whether it is
+        rather poses that come too late, of a vehicle that yaws, which lets bearings scatter."""
         found = []
         parameters = 'range_std', 'bearing_std_deg'
-        for i, factor in enumerate(np.sqrt(self.factor(config)).tolist()):
-            sigmas = abs(2.0 * math.log(factor)) * math.sqrt(PRIOR + 0.5 * self.number[i])
-            if not self.are_learnt or sigmas < 3.0 or 1.0 / MATTERS < factor < MATTERS:
+        for i, factor in enumerate(self.noticed(config).tolist()):
+            if factor == 1.0:
                 continue
             times, word = (factor, 'more') if factor > 1.0 else (1.0 / factor, 'less')
-            own = f'; check {parameters[i]}' if self.own[i] > 0.5 * self.number[i] else ''
-            found.append(
-                f'{NAMES[i]} scatter {times:.0f} times {word} than stated: allowed for{own}'
-            )
+            verdict = 'allowed for'
+            if i == 1 and factor > 1.0 and late:
+                verdict = (
+                    'as if poses came later than navigation_delay_std holds, so '
+                    f'{UNSAFE}; check the stamps of nav'
+                )
+            elif self.own[i] > 0.5 * self.number[i]:
+                verdict += f'; check {parameters[i]}'
+            found.append(f'{NAMES[i]} scatter {times:.0f} times {word} than stated: {verdict}')
         return found

@@ -197,7 +197,11 @@ class ObstacleTracker:
         """Return what users should know of the echoes, in sentences."""
         known, config = self._stream.state.known, self.config
         advice = 'check range_std, bearing_std_deg and the variances of the detections'
-        found = known.scales.warnings(config) + known.clutter.warnings(config)
+        late = False
+        if known.scales.noticed(config)[1] > 1.0:
+            good = self._both(known)[1][known.confirmed]
+            late = 2 * np.count_nonzero(good < 0.5) > len(good)
+        found = known.scales.warnings(config, late) + known.clutter.warnings(config)
         if known.innovations.verdict > 0 or not known.scales.are_learnt:
             found += known.innovations.warnings('detections', advice)
         seen = known.obstacles.existence.detectability(config)[known.confirmed]
@@ -208,7 +212,7 @@ class ObstacleTracker:
                 f'{config.confirm_hits / share * known.clutter.interval:.0f} s to confirm'
             )
         shown = int(np.count_nonzero(known.confirmed))
-        found += known.navigation.warnings(known.sonar.course, shown)
+        found += known.navigation.warnings(known.sonar.course, shown, config, late)
         takes, wrong = known.untimed
         if takes:
             found.append(

@@ -15,8 +15,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-import functools
-import math
 from typing import Any, TYPE_CHECKING
 
 from attrs import evolve
@@ -26,7 +24,7 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.soundings import SIDES
 
 from ...offline.run_folder import read_truth, RunFolder
-from ..judging import Check, Judgement, JudgeOptions, Limit, naming
+from ..judging import JudgeOptions, Limit, naming, Scored
 from ..numbers import error, fill, look_up, Metric, NO_TRUTH
 from .profiles import profiles_of
 from .scoring import score
@@ -34,16 +32,15 @@ from .scoring import score
 if TYPE_CHECKING:
     from ..report import Section
 
-__all__ = ['judge', 'LIMIT']
+__all__ = ['LIMIT', 'METRICS', 'REMARK', 'scored', 'SEEN', 'summary_sentence']
 
 LIMIT = Limit(0.25, 'm', 'height RMSE', 'height.all.rmse_m')
 """Limit for recordings without one of their own, over all bins with an echo. On the scene of the
 paper the default reaches 0.15 m, and MUSIC, which has no terrain model, 0.27 m."""
 
 
-def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
+def scored(folder: RunFolder, run: Mapping[str, Any], options: JudgeOptions) -> Scored:
     """Score the floors of `folder`. Raises `BagError` when they or the truth cannot be read."""
-    run = folder.read_run()
     truth: list[Estimate] = []
     for topic, side in truth_topics(run).items():
         for table in read_truth(run, options.truth_bag, topic) or []:
@@ -59,15 +56,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
 
         return sections(run, folder.path, swath)
 
-    return Judgement(
-        run=run,
-        metrics=metrics,
-        words=summary_sentence,
-        shown=METRICS,
-        seen=SEEN,
-        sections=sections,
-        accuracy=functools.partial(_accuracy, metrics),
-    )
+    return metrics, sections
 
 
 def truth_topics(run: Mapping[str, Any]) -> dict[str, int | None]:
@@ -79,13 +68,6 @@ def truth_topics(run: Mapping[str, Any]) -> dict[str, int | None]:
         for topic, name in run['topics'].items()
         if name.endswith('snapshot')
     }
-
-
-def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:
-    height = metrics.get('height', {}).get('all', {})
-    if not height.get('n') or math.isnan(height['rmse_m']):
-        return None
-    return LIMIT.check(height['rmse_m'], at_most=at_most)
 
 
 def _unscored(metrics: Mapping[str, Any]) -> bool:
@@ -181,6 +163,7 @@ METRICS = (
 )
 
 
+REMARK = ''
 SEEN = '{pings} pings, {bins} range bins, {heard_share:.0%} with an echo'
 
 

@@ -78,6 +78,7 @@ def _of_pings(run: Mapping[str, Any], swath: Swath) -> Iterator[Section]:
         'Height along one ping. Dotted: truth. Shaded: two standard deviations, which should hold '
         f'95 % of the truth. Blue: the true rough patch.{_of_two(profile)}{which}',
         profile_figure(profile),
+        picture=True,
     )
     if (snapshot := _snapshot(run, profile)) is not None:
         spacing = spacing_of(snapshot, BathymetryConfig.from_mapping(run['parameters']))

@@ -57,7 +57,7 @@ class Profile:
     probabilities (n, M) of the models; valid: bins with an echo of one surface; two: bins with
     echoes of two, None where the tracker does not look for them; truth: None where unknown;
     side: empty where the estimate does not say it; rough: probability (n,) of rough floor where
-    the estimate itself says it, as those of a bank do; verdict (n,): smooth 0, rough 1 or cannot
+    the estimate itself says it; verdict (n,): smooth 0, rough 1 or cannot
     tell 2, None where the estimate does not say it; upper: height m and standard deviation
     (n,) each of the upper of two surfaces, NaN for none, None where the tracker does not say them:
     the height is then that of the lower, and unsure (n,): bins with an echo of one surface or two.
@@ -120,11 +120,11 @@ def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None)
 
 def rough_models(names: tuple[str, ...]) -> BoolArray:
     """Return which models (M,) mean rough floor. Beside a constant slope it is the random walk,
-    beside `steady` floor the rough `KINDS` and what scatters or walks; in a bank, whose noise
-    grows from model to model, the upper half. A single model never does."""
+    beside `steady` floor the rough `KINDS`; of walks, whose noise grows from model to model, the
+    upper half. A single model never does."""
     if 'steady' in names:
         known = {kind.name for kind in KINDS if kind.rough}
-        return np.array([name in known or name.startswith(('scatter', 'rw')) for name in names])
+        return np.array([name in known for name in names])
     if 'ncs' in names:
         return np.array([name == 'rw' for name in names])
     rough = np.arange(len(names)) >= len(names) // 2

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-import functools
 from itertools import chain
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -28,7 +27,7 @@ from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.georeferencing import Georeferencer
 
 from ...offline.run_folder import read_measurements, read_truth, RunFolder
-from ..judging import Check, Judgement, JudgeOptions, Limit, naming
+from ..judging import JudgeOptions, Limit, naming, Scored
 from ..numbers import (
     chi2,
     counted,
@@ -48,16 +47,15 @@ from .series import series_of, Truth
 if TYPE_CHECKING:
     from ..report import Section
 
-__all__ = ['judge', 'LIMIT']
+__all__ = ['LIMIT', 'METRICS', 'REMARK', 'scored', 'SEEN', 'summary_sentence']
 
 LIMIT = Limit(1.25, 'm', 'position RMSE', 'position.rmse_m')
 """Limit for recordings without one of their own. The raw fixes of Table 1 have 1.71 m and its best
 tracker 0.85 m on average; one recording can be worse than the average."""
 
 
-def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
+def scored(folder: RunFolder, run: Mapping[str, Any], options: JudgeOptions) -> Scored:
     """Score the tracks of `folder`. Raises `BagError` when they or the truth cannot be read."""
-    run = folder.read_run()
     with naming(folder.path):
         series = series_of(folder.read_estimates())
     truth = _truth(run, options)
@@ -77,15 +75,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         origin = Origin(**run['origin']) if run.get('origin') else config.stated_origin()
         return sections(metrics, series, truth, raw, origin, run.get('target_names'))
 
-    return Judgement(
-        run=run,
-        metrics=metrics,
-        words=summary_sentence,
-        shown=METRICS,
-        seen=seen,
-        sections=sections,
-        accuracy=functools.partial(_accuracy, metrics),
-    )
+    return metrics, sections
 
 
 def _truth(run: Mapping[str, Any], options: JudgeOptions) -> Truth | None:
@@ -96,16 +86,12 @@ def _truth(run: Mapping[str, Any], options: JudgeOptions) -> Truth | None:
         return Truth.from_series(series_of(rows), max_gap=options.gap).shifted(options.lag)
 
 
-def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:
-    position = metrics.get('position', {})
-    if not position.get('n'):
-        return None
+def _remark(metrics: Mapping[str, Any]) -> str:
     raw = metrics.get('raw_fix', {}).get('rmse_m')
     remarks = [f'raw fixes {raw:.2f} m'] if raw else []
     if metrics['beyond_cutoff']['n']:
         remarks.insert(0, f'{metrics["tracks"]["completeness"]:.0%} complete')
-    remark = f' ({", ".join(remarks)})' if remarks else ''
-    return LIMIT.check(position['rmse_m'], at_most=at_most, remark=remark)
+    return f' ({", ".join(remarks)})' if remarks else ''
 
 
 def _unscored(metrics: Mapping[str, Any]) -> bool:
@@ -191,6 +177,9 @@ def seen(metrics: Mapping[str, Any]) -> str:
     of = '' if true is None else f' of {counted(true, "diver")}'
     found = counted(metrics['tracks_confirmed'], 'track') + of
     return fill(f'{found}, {{stamps}} stamps in {{span_s:.0f}} s', metrics)
+
+
+SEEN, REMARK = seen, _remark
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:

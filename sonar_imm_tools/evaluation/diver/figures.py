@@ -66,6 +66,7 @@ def sections(
         'Seen from above. Dotted: truth. Crosses: raw fixes. Shaded: ellipses that should hold '
         'the target 95 % of the time.',
         in_metres if origin is None else in_degrees(in_metres, origin),
+        picture=True,
     )
     track_id = series.longest_track()
     if track_id is None:

@@ -16,11 +16,10 @@ and `figures` present the result.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-import functools
 from typing import Any, TYPE_CHECKING
 
 from ...offline.run_folder import read_truth, RunFolder
-from ..judging import Check, Judgement, JudgeOptions, Limit
+from ..judging import JudgeOptions, Limit, Scored
 from ..numbers import error, fill, Metric, NO_TRUTH
 from .records import records_of
 from .scoring import CUTOFF, score
@@ -28,16 +27,15 @@ from .scoring import CUTOFF, score
 if TYPE_CHECKING:
     from ..report import Section
 
-__all__ = ['judge', 'LIMIT']
+__all__ = ['LIMIT', 'METRICS', 'REMARK', 'scored', 'SEEN', 'summary_sentence']
 
 LIMIT = Limit(0.08, 'm', 'OSPA', 'ospa_m')
 """Limit for recordings without one of their own. The best configuration has 0.05 m on average over
 long drifts; one recording can be worse than the average."""
 
 
-def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
+def scored(folder: RunFolder, run: Mapping[str, Any], options: JudgeOptions) -> Scored:
     """Score the reflectors of `folder`. Raises `BagError` when it or the truth cannot be read."""
-    run = folder.read_run()
     records = records_of(
         folder.read_estimates(),
         read_truth(run, options.truth_bag),
@@ -53,25 +51,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
 
         return sections(run, metrics, records)
 
-    return Judgement(
-        run=run,
-        metrics=metrics,
-        words=summary_sentence,
-        shown=METRICS,
-        seen=SEEN,
-        sections=sections,
-        accuracy=functools.partial(_accuracy, metrics),
-    )
-
-
-def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:
-    if not metrics.get('scored_records'):
-        return None
-    return LIMIT.check(
-        metrics['ospa_m'],
-        at_most=at_most,
-        remark=f' (number right in {100 * metrics["order_right"]:.0f} % of the records)',
-    )
+    return metrics, sections
 
 
 def _unscored(metrics: Mapping[str, Any]) -> bool:
@@ -123,6 +103,7 @@ METRICS = (
 )
 
 
+REMARK = ' (number right in {order_right:.0%} of the records)'
 SEEN = '{reflectors_mean:.1f} reflectors per record, {records} records'
 
 

@@ -44,6 +44,7 @@ def sections(
         'Grey: the response. Lines: the reflectors that were found, one colour per identity. '
         'Yellow: the true depths, where they are known.',
         response_figure(response_image(run), committed, start),
+        picture=True,
     )
     if not committed:
         return

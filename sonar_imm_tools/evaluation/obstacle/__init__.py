@@ -16,7 +16,6 @@ present it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-import functools
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -24,7 +23,7 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
 
 from ...offline.run_folder import read_measurements, read_truth, RunFolder
-from ..judging import Check, Judgement, JudgeOptions, Limit, naming
+from ..judging import JudgeOptions, Limit, naming, Scored
 from ..numbers import chi2, counted, each, error, fill, look_up, Metric, NO_TRUTH, UNMATCHED
 from .scoring import motion_metrics, NEAR, score, tether_length
 from .series import series_of, truth_of
@@ -32,9 +31,12 @@ from .series import series_of, truth_of
 if TYPE_CHECKING:
     from ..report import Section
 
-__all__ = ['judge', 'LIMIT']
+__all__ = ['LIMIT', 'METRICS', 'REMARK', 'scored', 'SEEN', 'summary_sentence']
 
-LIMIT = Limit(2.5, 'm', 'vertical offset RMSE within 50 m', 'vertical_offset_near.rmse_m')
+LIMIT = Limit(
+    2.5, 'm', 'vertical offset RMSE within 50 m', 'vertical_offset_near.rmse_m',
+    missed='no obstacle was tracked to within 50 m',
+)  # fmt: skip
 """Limit for recordings without one of their own. 300 runs have 1.6 m at 50 m and 0.9 m at 20 m on
 average; one recording can be worse than the average."""
 
@@ -42,9 +44,8 @@ CUTOFF = 5.0
 """Metres in range and bearing from which a track is on no obstacle."""
 
 
-def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
+def scored(folder: RunFolder, run: Mapping[str, Any], options: JudgeOptions) -> Scored:
     """Score the tracks of `folder`. Raises `BagError` when they or the truth cannot be read."""
-    run = folder.read_run()
     with naming(folder.path):
         series = series_of(folder.read_estimates())
     tables = read_truth(run, options.truth_bag)
@@ -67,33 +68,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         yield from map_section(series, received, origin)
         yield from sections(metrics, series, truth, found, received, options.gap)
 
-    return Judgement(
-        run=run,
-        metrics=metrics,
-        words=summary_sentence,
-        shown=METRICS,
-        seen=seen,
-        sections=sections,
-        accuracy=functools.partial(_accuracy, metrics),
-    )
-
-
-def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:
-    if 'vertical_offset_near' not in metrics:
-        return None
-    near = metrics['vertical_offset_near']
-    if not near['n']:
-        return Check(
-            f'{LIMIT.meaning} against truth',
-            'no obstacle was tracked to within 50 m',
-            'at least one',
-            good=False,
-        )
-    return LIMIT.check(
-        near['rmse_m'],
-        at_most=at_most,
-        remark=f' (band holds {100 * metrics["consistency"]["band_coverage"]:.0f} % of the truth)',
-    )
+    return metrics, sections
 
 
 METRICS = (
@@ -175,6 +150,10 @@ def seen(metrics: Mapping[str, Any]) -> str:
     if true is not None:
         found = f'{metrics["tracks"]["found_obstacles"]} of {counted(true, "obstacle")}'
     return fill(f'{found}, {{pings}} pings in {{span_s:.0f}} s', metrics)
+
+
+SEEN = seen
+REMARK = ' (band holds {consistency.band_coverage:.0%} of the truth)'
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:

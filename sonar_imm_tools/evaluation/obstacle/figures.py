@@ -59,6 +59,7 @@ def sections(
         'How far each obstacle lies below the sonar, as it comes nearer from left to right. '
         'Shaded: the 90 % band. Dotted: truth.',
         offset_figure(series, _truths(found, truth), gap),
+        picture=True,
     )
     yield Section(
         'Above or below',

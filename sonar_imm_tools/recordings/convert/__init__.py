@@ -19,7 +19,7 @@ from collections.abc import Callable
 
 from ..conversion import ConversionReport
 from ..convert_options import OPTIONS
-from ..csv_table import CsvOptions
+from ..tables import CsvOptions
 from ..truth import convert_truth
 from .archives import convert_snapshots, convert_traces
 from .arrivals import convert_arrivals

@@ -35,10 +35,11 @@ from sonar_imm.truth import PRESENT, TrueProfile, TrueReflectors
 
 from ..conversion import ConversionReport, converter, Record, write_bag
 from ..convert_options import SnapshotsOptions, TracesOptions
-from ..csv_table import CsvTable, Row
+from ..csv_table import CsvTable
 from ..mcap_records import MAX_RATIO, MAX_UNPACKED, TOO_LARGE
 from ..messages import ros_message
 from ..sources import BagError
+from ..tables import Row
 from ..truth import records_of
 from .navigation import ARRAYS, navigation_of_arrays, navigation_of_table
 

@@ -39,10 +39,11 @@ from sonar_imm.measurements import Arrivals, Rejection
 from ..columns import LOTEK, name_of, THELMA
 from ..conversion import ConversionReport, converter, flags_of, Record, write_bag
 from ..convert_options import ArrivalsOptions, DetectionsOptions
-from ..csv_table import CsvOptions, CsvTable, Row, Table
+from ..csv_table import CsvTable
 from ..messages import ros_message
 from ..places import LocalFrame, origin_parameters
 from ..sources import BagError
+from ..tables import CsvOptions, Row, Table
 from ..times import BadRow
 from ..truth import number_names, truth_records
 

@@ -35,8 +35,9 @@ from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 from ... import SECOND
 from ..conversion import ConversionReport, converter
 from ..convert_options import DetectionsOptions
-from ..csv_table import CsvTable, Row
+from ..csv_table import CsvTable
 from ..sources import BagError
+from ..tables import Row
 from ..times import BadRow
 from .arrivals import Arrival, name_columns, Places, read_places, Stations, write_pings
 
@@ -52,8 +53,8 @@ LONGEST_PING = 1.0
 """Seconds from the first to the last detection of a ping, at most, where none is stated."""
 LEAST_STAMPS = 10
 """Stamps by which their resolution is judged."""
-RESOLUTIONS = (60.0, 1.0, 0.1, 0.01, 0.001)
-"""Seconds to which receivers or exports round their stamps."""
+RESOLUTIONS = (60.0, 1.0)
+"""Seconds to which receivers or exports round their stamps, beside parts of a second."""
 SMALL = 1e-3
 """Part of the size of an array below which the travel in one resolution does not matter."""
 
@@ -214,8 +215,10 @@ def _rounding(
     """The standard deviation of stamps that are rounded, s; None where their resolution is small
     beside `size`, the seconds of travel across the receivers. Raises `BagError` where it is as
     large."""
-    steps = stamp_ns - how.options.time_offset_ns
-    step = next((each for each in RESOLUTIONS if not (steps % round(each * SECOND)).any()), 0.0)
+    stated = stamp_ns - how.options.time_offset_ns
+    parts = int(np.gcd.reduce(stated - stated.min(initial=0), initial=0)) / SECOND
+    whole = (each for each in RESOLUTIONS if not (stated % round(each * SECOND)).any())
+    step = next(whole, min(parts, 1.0))
     if len(stamp_ns) < LEAST_STAMPS or step < SMALL * size or not size:
         return None
     std = step / 12.0**0.5

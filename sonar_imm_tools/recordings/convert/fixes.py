@@ -25,10 +25,10 @@ from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 from ..columns import name_of, rank_of, UNRELATED
 from ..conversion import ask_for_units, ConversionReport, converter, Record, write_bag
 from ..convert_options import FixesOptions
-from ..csv_table import Row, Table
 from ..messages import ros_message
 from ..places import bearings_from, LocalFrame, origin_parameters, PolarRows
 from ..sources import BagError, quoted
+from ..tables import Row, Table
 from ..times import BadRow
 from ..track_files import open_table
 from ..truth import number_names, truth_records
@@ -68,7 +68,7 @@ def write_fixes(
         if not how.bearings:
             _ask_for_vessel(table)
         bearings = bearings_from(table, how.bearings, 'north')
-        polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg)
+        polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg, how.ranges)
     elif table.has('range', 'bearing') and _may_be_of_vessel(table):
         names = ('x', 'y') if table.has('x', 'y') else ('latitude', 'longitude')
         headers = [table.header(name) for name in names]

@@ -26,10 +26,11 @@ from sonar_imm.measurements import Rejection
 
 from ..conversion import ConversionReport, flags_of
 from ..conversion import Record as Stamped
-from ..csv_table import CsvOptions, CsvTable, Row
+from ..csv_table import CsvTable
 from ..places import Degrees
 from ..positions import write_position
 from ..sources import BagError
+from ..tables import CsvOptions, Row
 from ..times import BadRow
 from .sonar_files import Frame, navigation_messages, Record
 

@@ -64,6 +64,8 @@ ACCURATE, INACCURATE = 5.0, 15.0
 SENTENCE = re.compile(r'^(?P<before>.*?)(?P<sentence>[$!][A-Z]{4,8},.*?\*[0-9A-Fa-f]{2})\s*$')
 """A sentence, behind a time or a tag block where there is one."""
 USBL = ('USRTH', 'PSIMSSB', 'PSIMSNS')
+OTHER_USBL = ('PSIMLBP', 'PTSAG', 'PTSAX')
+"""Sentences of targets that are not read."""
 _CLOCK = re.compile(r'\d{6}(\.\d*)?$')
 _TAG_BLOCK = re.compile(r'\\(?:[^\\]*,)?c:(\d+)[^\\]*\\\s*$')
 
@@ -150,6 +152,12 @@ def _read(path: Path, report: ConversionReport, day: str) -> _Log:
             head = sentence[1:].partition(',')[0]
             if head in USBL:
                 _take_usbl(log, pynmea2.NMEASentence.checksum, sentence, stamp)
+            elif head in OTHER_USBL:
+                log.hears = True
+                raise BadRow(
+                    f'{head} is of a USBL and not read; --own fixes tracks the vessel itself',
+                    'not read',
+                )
             elif sentence[3:6] in ('VDM', 'VDO'):
                 _take_ais(log, pyais.decode(sentence.encode()), stamp, sentence[3:6] == 'VDO')
             else:

@@ -28,10 +28,11 @@ from sonar_imm.measurements import Fixes, RelativeFix, VesselFix, VesselHeading,
 
 from ..conversion import ConversionReport, converter, Leaps, Record, write_bag
 from ..convert_options import RelativeOptions
-from ..csv_table import CsvTable, Row
+from ..csv_table import CsvTable
 from ..messages import ros_message
 from ..places import bearings_from, checked_origin, Degrees, origin_parameters, PolarRows
 from ..sources import BagError
+from ..tables import Row
 from ..times import BadRow
 from ..truth import truth_records
 from .fixes import by_name
@@ -69,7 +70,7 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     if not table.has('forward', 'starboard'):
         table.require('range', 'bearing')
         bearings = bearings_from(table, how.bearings, 'bow')
-        polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg)
+        polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg, how.ranges)
     levelled = polar is not None and bearings != 'bow'
     if not levelled and not table.has('heading'):
         left = [

@@ -28,10 +28,11 @@ from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
 
 from ..conversion import ConversionReport, converter
 from ..convert_options import PicturesOptions, XtfOptions
-from ..csv_table import CsvTable, Row
+from ..csv_table import CsvTable
 from ..messages import ros_message
 from ..places import Degrees
 from ..sources import BagError
+from ..tables import Row
 from ..times import BadRow
 from ..xtf import pings_in
 from .bag_images import SYSTEM

@@ -36,22 +36,13 @@ def estimate(state='height', *, stamp_ns=7, ranges=RANGES, **columns):
 def truth(ranges, *, stamp_ns=7, **columns):
     n = len(ranges)
     values = {
-        'range': ranges,
-        'height': np.arange(n) * 1.0,
-        'angle': np.arange(n) * 0.1,
-        'patch': np.arange(n) % 2,
-        'valid': np.ones(n, np.uint8),
-        **columns,
-    }
+        'range': ranges, 'height': np.arange(n) * 1.0, 'angle': np.arange(n) * 0.1,
+        'patch': np.arange(n) % 2, 'valid': np.ones(n, np.uint8), **columns,
+    }  # fmt: skip
     return Estimate(
-        stamp_ns=stamp_ns,
-        frame_id='sonar',
-        xyz=np.zeros((n, 3)),
-        state_names=(),
-        state=np.empty((n, 0)),
-        covariance=np.empty((n, 0, 0)),
-        extras=values,
-    )
+        stamp_ns=stamp_ns, frame_id='sonar', xyz=np.zeros((n, 3)), state_names=(),
+        state=np.empty((n, 0)), covariance=np.empty((n, 0, 0)), extras=values,
+    )  # fmt: skip
 
 
 def test_the_standard_deviation_of_what_is_no_state_follows_from_the_arm():
@@ -94,6 +85,6 @@ def test_pings_meet_the_truth_of_their_own_stamp():
 def test_which_models_are_rough():
     assert rough_models(('rw', 'ncs')).tolist() == [True, False]
     assert rough_models(('rw_smooth', 'rw_rough')).tolist() == [False, True]
-    assert rough_models(('rw_1', 'rw_2', 'rw_3', 'rw_4')).tolist() == [False, False, True, True]
-    assert rough_models(('rw_1',)).tolist() == [False]
+    assert rough_models(('steady', 'winding', 'walk')).tolist() == [False, False, True]
+    assert rough_models(('rw_smooth',)).tolist() == [False]
     assert rough_models(()).tolist() == []

@@ -130,13 +130,10 @@ def test_what_is_called_smooth_and_rough_and_how_much_of_it_is():
     metrics = score(swath(called))
     assert metrics['verdicts'] == pytest.approx(
         {
-            'smooth': 0.3,
-            'rough': 0.2,
-            'cannot_tell': 0.5,
-            'smooth_right': 4 / 6,
+            'smooth': 0.3, 'rough': 0.2, 'cannot_tell': 0.5, 'smooth_right': 4 / 6,
             'rough_right': 0.5,
         }
-    )
+    )  # fmt: skip
     assert dict(lines(METRICS, metrics))['of these right, smooth / rough'] == '66.7 % / 50.0 %'
     unknown = score(swath(evolve(called, truth=None)))
     assert set(unknown['verdicts']) == {'smooth', 'rough', 'cannot_tell'}
@@ -184,11 +181,9 @@ def test_both_heights_are_compared_with_the_nearest_surface():
     height = np.full(N, 0.1)
     height[4:8] = 2.2  # the lower estimate lies near what is strongest
     truth = evolve(
-        profile().truth,
-        height=np.where(two, 2.0, 0.0),
-        surfaces=np.where(two, 2, 1),
+        profile().truth, height=np.where(two, 2.0, 0.0), surfaces=np.where(two, 2, 1),
         height_2=np.where(two, 3.0, np.nan),
-    )
+    )  # fmt: skip
     unsure = np.zeros(N, bool)
     unsure[15] = True
     upper = np.where(two, 2.6, np.nan), np.where(two, 0.15, np.nan)

@@ -45,16 +45,10 @@ def record(found, true, stamp=1, order=None, **extra):
     pmf = np.zeros(6)
     pmf[(len(found) if order is None else order) - 1] = 1.0
     return Record(
-        stamp_ns=stamp * SECOND,
-        preview=extra.get('preview', False),
-        found=found,
-        depth_std=np.full(len(found), 0.05),
-        existence=np.ones(len(found)),
-        pmf=pmf,
-        order_min=1,
-        sigma=1.0,
-        true=true,
-    )
+        stamp_ns=stamp * SECOND, preview=extra.get('preview', False), found=found,
+        depth_std=np.full(len(found), 0.05), existence=np.ones(len(found)), pmf=pmf, order_min=1,
+        sigma=1.0, true=true,
+    )  # fmt: skip
 
 
 def test_a_set_lies_no_distance_from_itself():

@@ -92,22 +92,9 @@ def test_the_image_is_seen_from_above_with_starboard_to_the_right():
 def test_scores_are_those_done_by_hand():
     # At seconds 10 and 11 the range is 42 and 40 m. One track is 1 m too deep, then 2 m; the band
     # holds the truth once; a false track and a tentative one are about.
-    estimates = [
-        estimate(
-            10,
-            [
-                [4, 1, 42.3, 0.0, 4.0, 1.0, 2.0, 5.0, 0.1],
-                [5, 1, 20.0, 0.3, 0.0, 1.0, -1.0, 1.0, 0.5],
-            ],
-        ),
-        estimate(
-            11,
-            [
-                [4, 2, 40.0, 0.01, 5.0, 1.0, 4.0, 6.0, 0.2],
-                [6, 0, 40.0, 0.0, 3.0, 1.0, 2.0, 4.0, 0.5],
-            ],
-        ),
-    ]
+    ten = [4, 1, 42.3, 0.0, 4.0, 1.0, 2.0, 5.0, 0.1], [5, 1, 20.0, 0.3, 0, 1.0, -1.0, 1.0, 0.5]
+    eleven = [4, 2, 40.0, 0.01, 5.0, 1.0, 4.0, 6.0, 0.2], [6, 0, 40.0, 0, 3.0, 1.0, 2.0, 4.0, 0.5]
+    estimates = [estimate(10, ten), estimate(11, eleven)]
     assert series_of(estimates).place[1] == pytest.approx([20.0, 0.3])
     metrics, found = score(series_of(estimates), (straight(1, 3.0),), cutoff=5.0, gap=60.0)
     assert (metrics['pings'], metrics['span_s']) == (2, 1.0)
@@ -116,28 +103,18 @@ def test_scores_are_those_done_by_hand():
     assert metrics['bearing']['rmse_deg'] == pytest.approx(np.degrees(0.01) / np.sqrt(2.0))
     assert metrics['vertical_offset_near']['n'] == 2
     assert metrics['consistency']['nees_offset']['mean'] == pytest.approx(2.5)
-    assert [metrics['consistency'][name]['dof'] for name in ('nees_offset', 'nees_state')] == [
-        1,
-        3,
-    ]
+    dofs = [metrics['consistency'][name]['dof'] for name in ('nees_offset', 'nees_state')]
+    assert dofs == [1, 3]
     assert metrics['consistency']['band_coverage'] == 0.5
     assert metrics['above']['brier'] == pytest.approx((0.01 + 0.04) / 2.0)
-    assert metrics['above']['bins']['0.1 to 0.3'] == {
-        'n': 2,
-        'stated': pytest.approx(0.15),
-        'came_true': 0.0,
-    }
+    stated = {'n': 2, 'stated': pytest.approx(0.15), 'came_true': 0.0}
+    assert metrics['above']['bins']['0.1 to 0.3'] == stated
     # GOSPA: sqrt(0.3^2 + 5^2/2), sqrt((40 * 0.01)^2).
     chord = np.hypot(40.0 * (1.0 - np.cos(0.01)), 40.0 * np.sin(0.01))
     assert metrics['gospa']['mean_m'] == pytest.approx((np.sqrt(0.09 + 12.5) + chord) / 2.0)
     assert metrics['gospa']['false_per_ping'] == pytest.approx(0.5)
-    assert metrics['tracks'] == {
-        'true_obstacles': 1,
-        'found_obstacles': 1,
-        'tracks': 2,
-        'false_tracks': 1,
-        'identity_switches': 0,
-    }
+    counts = {'true_obstacles': 1, 'found_obstacles': 1, 'tracks': 2, 'false_tracks': 1}
+    assert metrics['tracks'] == {**counts, 'identity_switches': 0}
     assert found.target.tolist() == [0, 0]
 
 
@@ -198,32 +175,12 @@ def test_truth_between_its_stamps_is_interpolated_but_not_across_gaps():
 
 
 def test_estimates_and_truth_of_something_else_are_refused():
+    place = {name: np.zeros(1, np.float32) for name in 'xyz'}
+    bare = Estimate.from_columns(place, stamp_ns=1, frame_id='')
     with pytest.raises(ValueError, match='not those of obstacles'):
-        series_of(
-            [
-                Estimate(
-                    stamp_ns=1,
-                    frame_id='',
-                    xyz=np.zeros((1, 3), np.float32),
-                    state_names=('px',),
-                    state=np.zeros((1, 1)),
-                    covariance=np.ones((1, 1, 1)),
-                )
-            ]
-        )
+        series_of([bare])
     with pytest.raises(ValueError, match="no column 'range'"):
-        truth_of(
-            [
-                Estimate(
-                    stamp_ns=1,
-                    frame_id='',
-                    xyz=np.zeros((1, 3), np.float32),
-                    state_names=(),
-                    state=np.zeros((1, 0)),
-                    covariance=np.zeros((1, 0, 0)),
-                )
-            ]
-        )
+        truth_of([bare])
 
 
 @pytest.fixture(scope='module')

@@ -21,7 +21,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from msg_adapters.table import decode_table, encode_table
 from sonar_imm.nodes.messages import make
 
-from .cases import Action, Case, CASES, Message, SECOND, Step
+from .cases import Action, CASES, Message, SECOND, Step
 
 Parts = tuple[list[Step], list[Step]]
 Disturbance = Callable[[list[Message], list[Message], list[Message]], Parts]
@@ -231,11 +231,11 @@ def long_enough(during: list[Message]) -> list[Step]:
 HOUR = 3600.0
 
 
-@frozen(kw_only=True)
+@frozen
 class Fault:
     """One thing that goes wrong.
 
-    disturb: makes the disturbance for a case. counted: reasons of losses in /diagnostics, one of
+    disturb: the disturbance. counted: reasons of losses in /diagnostics, one of
     which must be there, patterns; empty: nothing may be lost. level: what the worst level of
     /diagnostics must at least be. says: what /diagnostics or the log must say, a pattern. settle:
     messages within which estimates must be as if nothing had been, None for those of a tracker
@@ -243,7 +243,7 @@ class Fault:
     """
 
     name: str
-    disturb: Callable[[Case], Disturbance]
+    disturb: Disturbance
     counted: Sequence[str] = ()
     level: str = 'OK'
     says: str = ''
@@ -256,164 +256,74 @@ ANY_ORDER = ('diver', 'obstacle', 'bathymetry')
 ONCE = ('fathometer',)
 IN_ORDER = ('diver', 'obstacle', 'fathometer')
 SIMULATED = ('-p', 'use_sim_time:=true')
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def in_another_unit(name: str, systems: Sequence[str], **factors: float) -> Fault:
+    """Columns in a unit that no reader takes."""
+    refused = ['refused: out_of_range']
+    return Fault(
+        name, each(columns(**factors)), refused, 'WARN', says='out_of_range', systems=systems
+    )
+
 
 FAULTS = (
-    Fault(name='sensor restarted', disturb=lambda case: sensor_restarted()),
+    Fault('sensor restarted', sensor_restarted()),
     Fault(
-        name='input disabled, then enabled',
-        disturb=lambda case: disabled(),
-        counted=['ignored_while_disabled'],
+        'input disabled, then enabled', disabled(), ['ignored_while_disabled'],
         says='input is ignored',
     ),
-    Fault(name='~/reset', disturb=lambda case: node_reset(), says='reset on request'),
+    Fault('~/reset', node_reset(), says='reset on request'),
+    Fault('every message twice', twice(), ['duplicate', 'repeated'], settle=0, systems=IN_ORDER),
     Fault(
-        name='every message twice',
-        disturb=lambda case: twice(),
-        counted=['duplicate', 'repeated'],
-        settle=0,
-        systems=IN_ORDER,
+        'every ping twice, no ping needs another', twice(), settle=0, systems=['bathymetry'],
     ),
+    Fault('late messages, inside the window', late(), settle=0, systems=ANY_ORDER),
+    Fault('late messages, no window', late(), ['too_late'], systems=ONCE),
+    Fault('shuffled inside the window', shuffled(), settle=0, systems=ANY_ORDER),
+    Fault('shuffled, no window', shuffled(), ['too_late'], systems=ONCE),
+    Fault('a burst', burst(), settle=0),
+    Fault('sensor clock two hours ahead', clock_set(2.0 * HOUR)),
+    Fault('sensor clock two hours back', clock_set(-2.0 * HOUR)),
     Fault(
-        name='every ping twice, no ping needs another',
-        disturb=lambda case: twice(),
-        settle=0,
-        systems=['bathymetry'],
-    ),
-    Fault(
-        name='late messages, inside the window',
-        disturb=lambda case: late(),
-        settle=0,
-        systems=ANY_ORDER,
-    ),
-    Fault(
-        name='late messages, no window',
-        disturb=lambda case: late(),
-        counted=['too_late'],
-        systems=ONCE,
-    ),
-    Fault(
-        name='shuffled inside the window',
-        disturb=lambda case: shuffled(),
-        settle=0,
-        systems=ANY_ORDER,
-    ),
-    Fault(
-        name='shuffled, no window',
-        disturb=lambda case: shuffled(),
-        counted=['too_late'],
-        systems=ONCE,
-    ),
-    Fault(name='a burst', disturb=lambda case: burst(), settle=0),
-    Fault(
-        name='sensor clock two hours ahead',
-        disturb=lambda case: clock_set(2.0 * HOUR),
-    ),
-    Fault(
-        name='sensor clock two hours back',
-        disturb=lambda case: clock_set(-2.0 * HOUR),
-    ),
-    Fault(
-        name='/clock and stamps an hour back',
-        disturb=lambda case: simulated_clock(-HOUR),
-        says='/clock is back',
+        '/clock and stamps an hour back', simulated_clock(-HOUR), says='/clock is back',
         arguments=SIMULATED,
     ),
+    Fault('/clock and stamps an hour ahead', simulated_clock(HOUR), arguments=SIMULATED),
+    Fault('looped recording', looped),
+    Fault('no navigation for a while', dropped('nav'), systems=['obstacle']),
     Fault(
-        name='/clock and stamps an hour ahead',
-        disturb=lambda case: simulated_clock(HOUR),
-        arguments=SIMULATED,
+        'another frame for a while', each(frame('elsewhere')), ['refused: frame', 'other_frame'],
+        level='WARN', says='frame',
     ),
-    Fault(name='looped recording', disturb=lambda case: looped),
-    Fault(
-        name='no navigation for a while',
-        disturb=lambda case: dropped('nav'),
-        systems=['obstacle'],
-    ),
-    Fault(
-        name='another frame for a while',
-        disturb=lambda case: each(frame('elsewhere')),
-        counted=['refused: frame', 'other_frame'],
-        level='WARN',
-        says='frame',
-    ),
-    Fault(
-        name='a second publisher, its clock late',
-        disturb=lambda case: second_publisher(case.window + 3.0),
-        counted=['too_late'],
-        level='WARN',
-        says='not used: too_late',
-        settle=0,
-        systems=('diver', 'obstacle'),
+    *(
+        Fault(
+            'a second publisher, its clock late', second_publisher(CASES[system].window + 3.0),
+            ['too_late'], level='WARN', says='not used: too_late', settle=0, systems=[system],
+        )
+        for system in ('diver', 'obstacle')
     ),
     # Four messages, which are too few for a warning.
     Fault(
-        name='a second publisher, its clock late',
-        disturb=lambda case: second_publisher(case.window + 3.0),
-        counted=['too_late'],
-        settle=0,
+        'a second publisher, its clock late', second_publisher(3.0), ['too_late'], settle=0,
         systems=['fathometer'],
     ),
+    in_another_unit('bearings in degrees', ['obstacle'], bearing=57.29578),
+    in_another_unit('ranges in millimetres', ['obstacle', 'bathymetry'], range=1000.0),
+    in_another_unit('sound speed in feet per second', ['bathymetry'], sound_speed=3.28084),
     Fault(
-        name='bearings in degrees',
-        disturb=lambda case: each(columns(bearing=57.29578)),
-        counted=['refused: out_of_range'],
-        level='WARN',
-        says='out_of_range',
-        systems=['obstacle'],
+        'depths in feet', each(columns(depth=3.28084)), ['other_depths'], level='WARN',
+        says='not used: other_depths', systems=['fathometer'],
     ),
+    in_another_unit('depths in millimetres', ['fathometer'], depth=1000.0),
     Fault(
-        name='ranges in millimetres',
-        disturb=lambda case: each(columns(range=1000.0)),
-        counted=['refused: out_of_range'],
-        level='WARN',
-        says='out_of_range',
-        systems=['obstacle', 'bathymetry'],
+        'a publisher that cannot be heard (QoS)', unheard_publisher(BEST_EFFORT), level='WARN',
+        says='quality of service', settle=0,
     ),
+    Fault('storm of parameters', parameter_storm(), says='parameters changed', settle=0),
     Fault(
-        name='sound speed in feet per second',
-        disturb=lambda case: each(columns(sound_speed=3.28084)),
-        counted=['refused: out_of_range'],
-        level='WARN',
-        says='out_of_range',
-        systems=['bathymetry'],
-    ),
-    Fault(
-        name='depths in feet',
-        disturb=lambda case: each(columns(depth=3.28084)),
-        counted=['other_depths'],
-        level='WARN',
-        says='not used: other_depths',
-        systems=['fathometer'],
-    ),
-    Fault(
-        name='depths in millimetres',
-        disturb=lambda case: each(columns(depth=1000.0)),
-        counted=['refused: out_of_range'],
-        level='WARN',
-        says='out_of_range',
-        systems=['fathometer'],
-    ),
-    Fault(
-        name='a publisher that cannot be heard (QoS)',
-        disturb=lambda case: unheard_publisher(
-            QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-        ),
-        level='WARN',
-        says='quality of service',
-        settle=0,
-    ),
-    Fault(
-        name='storm of parameters',
-        disturb=lambda case: parameter_storm(),
-        says='parameters changed',
-        settle=0,
-    ),
-    Fault(
-        name='the state cannot be saved (read-only disk)',
-        disturb=lambda case: long_enough(),
-        level='WARN',
-        says='the state cannot be saved',
-        settle=0,
+        'the state cannot be saved (read-only disk)', long_enough(), level='WARN',
+        says='the state cannot be saved', settle=0,
         arguments=('-p', 'state_file:=/sys/sonar_imm_state'),
     ),
-)
+)  # fmt: skip

@@ -221,14 +221,8 @@ def _other_type(columns, rng):
 
 
 _COLUMNS = (
-    _odd_values,
-    _odd_values,
-    _odd_values,
-    _odd_rows,
-    _fewer_columns,
-    _other_count,
-    _other_type,
-)
+    _odd_values, _odd_values, _odd_values, _odd_rows, _fewer_columns, _other_count, _other_type,
+)  # fmt: skip
 
 
 def _encode(message, columns, rng, strange=False):
@@ -247,13 +241,10 @@ def _encode(message, columns, rng, strange=False):
         parts += [np.zeros((rows, gap), 'u1'), raw]
         fields.append(
             make(
-                'sensor_msgs/msg/PointField',
-                name=name,
-                offset=offset + gap,
-                datatype=_CODES[column.dtype.str[1:]],
-                count=column.shape[1],
+                'sensor_msgs/msg/PointField', name=name, offset=offset + gap,
+                datatype=_CODES[column.dtype.str[1:]], count=column.shape[1],
             )
-        )
+        )  # fmt: skip
         offset += gap + column.dtype.itemsize * column.shape[1]
     height = int(rng.choice([h for h in range(1, 5) if rows % h == 0])) if strange else 1
     table = np.concatenate(parts, axis=1) if rows and parts else np.zeros((rows, 0), 'u1')

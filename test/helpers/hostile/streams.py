@@ -51,10 +51,7 @@ VARIANTS = {
     'diver': (
         {'max_tracks': 4},
         {
-            'origin': [3.0, 3.0, 0.0],
-            'fix_bias_std': 0.5,
-            'tags': ['a'],
-            'max_tracks': 4,
+            'origin': [3.0, 3.0, 0.0], 'fix_bias_std': 0.5, 'tags': ['a'], 'max_tracks': 4,
         },
         {'dimensions': 3, 'association': 'jipda', 'max_tracks': 4},
         {'association': 'jipda', 'model_set': 'heading_speed', 'tags': ['a'], 'max_tracks': 4},
@@ -62,18 +59,11 @@ VARIANTS = {
     'fathometer': (
         {'particles': 40, 'order_max': 3, 'phones': 0, 'record_seconds': 0.2},
         {
-            'particles': 40,
-            'order_max': 2,
-            'phones': 0,
-            'smoothing_lag': 1,
-            'heave': 'memory',
+            'particles': 40, 'order_max': 2, 'phones': 0, 'smoothing_lag': 1, 'heave': 'memory',
             'record_distance': 5.0,
         },
         {
-            'particles': 40,
-            'order_max': 2,
-            'phones': 4,
-            'polarity': 'both',
+            'particles': 40, 'order_max': 2, 'phones': 4, 'polarity': 'both',
         },
     ),
     'obstacle': (
@@ -85,18 +75,15 @@ VARIANTS = {
         },
         {'behaviours': ['fixed'], 'max_tracks': 4},
     ),
-}
+}  # fmt: skip
 """Parameters of the trackers under test; small, since speed is not what is tried."""
 
 COVARIANCE = np.eye(2)
 FRAMES = {
-    ('obstacle', 'detections'): 'sonar',
-    ('obstacle', 'image'): 'sonar',
-    ('obstacle', 'altitude'): 'altimeter',
-    ('bathymetry', 'altitude'): 'altimeter',
-    ('fathometer', 'array_depth'): '',
-    ('fathometer', 'position'): '',
-}
+    ('obstacle', 'detections'): 'sonar', ('obstacle', 'image'): 'sonar',
+    ('obstacle', 'altitude'): 'altimeter', ('bathymetry', 'altitude'): 'altimeter',
+    ('fathometer', 'array_depth'): '', ('fathometer', 'position'): '',
+}  # fmt: skip
 """The frame of messages; 'map' where it is not said."""
 
 

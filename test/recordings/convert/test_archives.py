@@ -156,11 +156,9 @@ def test_navigation_in_a_table_beside_the_snapshots(convert, tmp_path):
         + '1000000005,bad,10.47,30,5,2\n'
     )
     report, received, _ = convert(
-        {'nav': tmp_path / 'nav.csv'},
-        iq=samples(3, 30, 2),
-        range=RANGES,
+        {'nav': tmp_path / 'nav.csv'}, iq=samples(3, 30, 2), range=RANGES,
         stamp=np.arange(3.0) + 1e9,
-    )
+    )  # fmt: skip
     poses = [item for item in received if isinstance(item, Navigation)]
     assert report.messages == {'/nav': 4, '/snapshot': 3} and report.bad_rows == 1
     assert poses[2].position == pytest.approx([0.0, 2e-5 * 111_414.0, -2.0], abs=1e-3)
@@ -197,17 +195,14 @@ def test_bad_pings_are_left_out_and_named(convert):
         ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': np.array(['M8', 's'])}, 'no numbers'),
         ({}, {'iq': samples(10, 4), 'range': RANGE, 'c': np.array('x')}, "'c' holds no numbers"),
         ({}, {'iq': samples(10, 4), 'range': RANGE.astype('m8[s]')}, "'range' holds no numbers"),
-        (
-            {},
-            {'iq': samples(10, 4), 'range': RANGE, 'sound_speed': np.ones(3)},
-            'one finite number',
-        ),
+        ({}, {'iq': samples(10, 4), 'range': RANGE, 'sound_speed': np.ones(3)},
+         'one finite number'),
         ({'staves': [[0, 4], [1]]}, {'iq': samples(10, 4), 'range': RANGE}, 'channels 0 to 3'),
         ({'names': {'iq': 'data'}}, {'iq': samples(10, 4), 'range': RANGE}, "no array 'data'"),
         ({'names': {'data': 'iq'}}, {'iq': samples(10, 4), 'range': RANGE}, 'unknown array'),
         ({}, {'iq': np.array([{}]), 'range': RANGE}, 'more than plain arrays'),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_converted_is_said_in_a_sentence(convert, options, arrays, word):
     with pytest.raises(BagError, match=word):
         convert(options, **arrays)
@@ -308,17 +303,15 @@ def test_bad_traces_are_left_out_by_name(archive):
         ({'depth': DEPTH}, "no array 'amplitude'"),
         ({'depth': DEPTH[:5], 'amplitude': ONES}, r'\(traces, n\) are needed'),
         ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [1.0]}, '3 traces need as many'),
-        (
-            {'depth': DEPTH, 'amplitude': np.ones((3, 40)), 'sigma': np.ones(7)},
-            'sigma has the shape',
-        ),
+        ({'depth': DEPTH, 'amplitude': np.ones((3, 40)), 'sigma': np.ones(7)},
+         'sigma has the shape'),
         ({'depth': DEPTH, 'amplitude': np.zeros((3, 40))}, 'silent'),
         ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [1e300] * 3}, '3 traces need as many'),
         ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [3e9] * 3}, 'before 2038'),
         ({'depth': DEPTH, 'amplitude': ONES, 'stamp': ['a'] * 3}, "'stamp' holds no numbers"),
         ({'depth': DEPTH, 'amplitude': ONES, 'sigma': 'x'}, "'sigma' holds no numbers"),
     ],
-)
+)  # fmt: skip
 def test_archives_that_make_no_sense_are_one_sentence(archive, arrays, words):
     path, out = archive(**arrays)
     with pytest.raises(BagError, match=words):
@@ -341,17 +334,10 @@ def line(tmp_path):
     """Seven traces of 30 samples every 100 us, four a second, from a recorder that starts late."""
     rows, path = np.arange(7), tmp_path / 'line.seg'
     write_segy(
-        path,
-        100 * rows[:, None] + np.arange(30),
-        3,
-        YearDataRecorded=2018,
-        DayOfYear=72,
-        HourOfDay=23,
-        MinuteOfHour=11,
-        SecondOfMinute=24 + rows // 4,
-        TRACE_SAMPLE_INTERVAL=100,
+        path, 100 * rows[:, None] + np.arange(30), 3, YearDataRecorded=2018, DayOfYear=72,
+        HourOfDay=23, MinuteOfHour=11, SecondOfMinute=24 + rows // 4, TRACE_SAMPLE_INTERVAL=100,
         DelayRecordingTime=20,
-    )
+    )  # fmt: skip
     return path
 
 

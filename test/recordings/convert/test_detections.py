@@ -277,6 +277,13 @@ def test_the_resolution_of_stamps_is_said_and_heeded(tmp_path, digits, std, word
     assert var == pytest.approx(std**2 / 12) if std else np.isnan(var).all()
 
 
+def test_days_of_five_digits_have_a_resolution_too(tmp_path):
+    head = 'excel_time,Receiver,Transmitter'
+    line = lambda t, r: f'{t / 86400 + 25569:.5f},{r},7'  # noqa: E731
+    with pytest.raises(BagError, match='a resolution of 0.864 s'):
+        exported(tmp_path, head, line)
+
+
 @pytest.mark.parametrize('period, words', [(0.7, '0.35 s'), (1.0, '0.5 s'), (30.0, '')])
 def test_pings_within_a_second_are_not_joined(tmp_path, period, words):
     head = 'Date and Time (UTC),Receiver,Transmitter'

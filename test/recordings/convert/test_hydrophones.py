@@ -42,14 +42,9 @@ def blocks_of(path):
 def test_blocks_are_the_samples(tmp_path, name, subtype):
     samples = sound(tmp_path / name, subtype=subtype)
     report = convert_hydrophones(
-        tmp_path / name,
-        tmp_path / 'out',
-        start='2024-05-31T10:00:00Z',
-        channels=[3, 2, 0],
-        full_scale=8.0,
-        depth=100.0,
-        block=0.7,
-    )
+        tmp_path / name, tmp_path / 'out', start='2024-05-31T10:00:00Z', channels=[3, 2, 0],
+        full_scale=8.0, depth=100.0, block=0.7,
+    )  # fmt: skip
     blocks = blocks_of(report.path)
     assert [block.stamp_ns for block in blocks] == [
         BEGIN_NS + 700_000_000 * k for k in range(len(blocks))

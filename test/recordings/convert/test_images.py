@@ -65,13 +65,11 @@ def bag(tmp_path):
             )
             pose = write_navigation(
                 Navigation(
-                    stamp_ns=second * 10**9,
-                    position=[0.5 * second, 0.0, -20.0],
-                    orientation=[0.0, 0.0, 0.0, 1.0],
-                    frame_id='odom',
+                    stamp_ns=second * 10**9, position=[0.5 * second, 0.0, -20.0],
+                    orientation=[0.0, 0.0, 0.0, 1.0], frame_id='odom',
                 ),
                 ros_message,
-            )
+            )  # fmt: skip
             writer.write(poses, second * 10**9 + 1, types.serialize_cdr(pose, pose.__msgtype__))
     return path
 
@@ -152,16 +150,10 @@ def ping360(angle, second):
         * (np.exp(-np.square((angle - 0.2) / 0.04)))
     )
     message = marine.make(
-        'ping360_sonar_msgs/msg/SonarEcho',
-        header=marine.header(sec=int(second)),
-        angle=float(angle % (2.0 * np.pi)),
-        gain=1,
-        number_of_samples=200,
-        transmit_frequency=740,
-        speed_of_sound=1500,
-        range=20,
-        intensities=np.minimum(samples, 255).astype('u1'),
-    )
+        'ping360_sonar_msgs/msg/SonarEcho', header=marine.header(sec=int(second)),
+        angle=float(angle % (2.0 * np.pi)), gain=1, number_of_samples=200, transmit_frequency=740,
+        speed_of_sound=1500, range=20, intensities=np.minimum(samples, 255).astype('u1'),
+    )  # fmt: skip
     message.header.stamp.nanosec = round(second % 1.0 * 1e9)
     return message
 

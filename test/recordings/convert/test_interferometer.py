@@ -49,26 +49,20 @@ def image(ping, samples, dtype='f4', **raw):
         ),
     )
     values = {
-        'sample_rate': RATE,
-        'samples_per_beam': len(samples),
-        'sample0': FIRST,
-        'tx_delays': marine.floats([]),
-        'tx_angles': marine.floats([]),
+        'sample_rate': RATE, 'samples_per_beam': len(samples), 'sample0': FIRST,
+        'tx_delays': marine.floats([]), 'tx_angles': marine.floats([]),
         'rx_angles': marine.floats([]),
-    }
+    }  # fmt: skip
     return marine.make(
         'RawSonarImage',
         header=head,
         ping_info=marine.ping_info(),
         image=marine.make(
-            'SonarImageData',
-            is_bigendian=False,
-            dtype=DTYPES.index(dtype),
-            beam_count=samples.shape[1],
-            data=data,
+            'SonarImageData', is_bigendian=False, dtype=DTYPES.index(dtype),
+            beam_count=samples.shape[1], data=data,
         ),
         **{**values, **raw},
-    )
+    )  # fmt: skip
 
 
 def phase_of(iq):
@@ -205,11 +199,9 @@ def test_from_images_to_a_floor(tmp_path, capsys):
         f'/stave_{p}': [image(ping, in_two(ping.iq[:, p])) for ping in PINGS] for p in range(2)
     }
     converted(
-        write(tmp_path / 'iq', staves),
-        tmp_path / 'out2',
-        *('--iq', '/stave_0', '--iq', '/stave_1'),
-        capsys=capsys,
-    )
+        write(tmp_path / 'iq', staves), tmp_path / 'out2',
+        *('--iq', '/stave_0', '--iq', '/stave_1'), capsys=capsys,
+    )  # fmt: skip
     assert height_error(snapshots_in(tmp_path / 'out2'))[0] < 0.15
 
 
@@ -240,12 +232,9 @@ def test_fields_are_found_by_the_names_that_are_told(tmp_path, capsys):
     ping = PINGS[0]
     counts = np.round(phase_of(ping.iq) / (2.0 * np.pi) * 65536).astype(np.int16)
     message = types.types[name](
-        header=image(ping, [1.0]).header,
-        strength=np.abs(ping.iq[:, 0]).astype(np.float32),
-        turn=counts,
-        fs=RATE,
-        c=1480.0,
-    )
+        header=image(ping, [1.0]).header, strength=np.abs(ping.iq[:, 0]).astype(np.float32),
+        turn=counts, fs=RATE, c=1480.0,
+    )  # fmt: skip
     bag = write(tmp_path / 'bag', {'/sss': [message]})
     names = {'amplitude': 'strength', 'phase': 'turn', 'sample_rate': 'fs', 'sound_speed': 'c'}
     given = [part for pair in names.items() for part in ('--field', '='.join(pair))]

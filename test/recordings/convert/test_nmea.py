@@ -256,6 +256,14 @@ def test_a_vessel_with_a_usbl_is_never_the_target(tmp_path, sentence, words):
         converted(tmp_path, [position('RMC', BEGIN), heading(90.0), sentence])
 
 
+@pytest.mark.parametrize('body', ['PSIMLBP,100000.00,B01,54.0,10.0', 'PTSAG,#1,100000.00,1,2'])
+def test_a_usbl_that_is_not_read_makes_the_vessel_no_target(tmp_path, body):
+    lines = [position('GGA', BEGIN), summed(body)]
+    with pytest.raises(BagError, match='is of a USBL and not read; --own fixes'):
+        converted(tmp_path, lines, date='2024-05-31')
+    assert converted(tmp_path, lines, date='2024-05-31', own='fixes').messages == {'/fix': 1}
+
+
 def test_sentences_that_are_not_known_are_counted_by_their_names(tmp_path):
     lines = [position('RMC', BEGIN), summed('GPXYZ,1'), summed('PFOO,1,2')]
     report = converted(tmp_path, lines)

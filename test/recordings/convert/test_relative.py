@@ -106,19 +106,13 @@ def test_a_bearing_without_a_unit_is_not_guessed(convert, kind, more):
     'columns, cells, options',
     [
         ('heading,forward,starboard', '90,30,10', {}),
-        (
-            'heading,range,bearing_deg',
-            f'90,{np.hypot(30, 10)},{np.degrees(np.arctan2(10, 30))}',
-            {},
-        ),
+        ('heading,range,bearing_deg', f'90,{np.hypot(30, 10)},{np.degrees(np.arctan2(10, 30))}',
+         {}),
         ('range,bearing_rad', f'{np.hypot(30, 10)},{-np.arctan2(10, 30)}', {'bearings': 'east'}),
-        (
-            'heading,range,bearing_deg',
-            f'77,{np.hypot(30, 10)},{90 + np.degrees(np.arctan2(10, 30))}',
-            {'bearings': 'north'},
-        ),
+        ('heading,range,bearing_deg',
+         f'77,{np.hypot(30, 10)},{90 + np.degrees(np.arctan2(10, 30))}', {'bearings': 'north'}),
     ],
-)
+)  # fmt: skip
 def test_a_vessel_that_heads_east_sees_what_is_ahead_and_to_starboard(
     convert, columns, cells, options
 ):

@@ -24,26 +24,12 @@ from sonar_imm_tools.recordings.times import gps_minus_utc
 
 pytest.importorskip('segyio')
 WORDS = {
-    'elevation_scalar': (69, 'h'),
-    'scalar': (71, 'h'),
-    'x': (73, 'i'),
-    'y': (77, 'i'),
-    'group_x': (81, 'i'),
-    'group_y': (85, 'i'),
-    'units': (89, 'h'),
-    'delay': (109, 'h'),
-    'count': (115, 'H'),
-    'interval': (117, 'H'),
-    'year': (157, 'h'),
-    'day': (159, 'h'),
-    'hour': (161, 'h'),
-    'minute': (163, 'h'),
-    'second': (165, 'h'),
-    'time_base': (167, 'h'),
-    'cdp_x': (181, 'i'),
-    'cdp_y': (185, 'i'),
-    'time_scalar': (215, 'h'),
-}
+    'elevation_scalar': (69, 'h'), 'scalar': (71, 'h'), 'x': (73, 'i'), 'y': (77, 'i'),
+    'group_x': (81, 'i'), 'group_y': (85, 'i'), 'units': (89, 'h'), 'delay': (109, 'h'),
+    'count': (115, 'H'), 'interval': (117, 'H'), 'year': (157, 'h'), 'day': (159, 'h'),
+    'hour': (161, 'h'), 'minute': (163, 'h'), 'second': (165, 'h'), 'time_base': (167, 'h'),
+    'cdp_x': (181, 'i'), 'cdp_y': (185, 'i'), 'time_scalar': (215, 'h'),
+}  # fmt: skip
 FILE_WORDS = {'interval': (17, 'H'), 'count': (21, 'H'), 'format': (25, 'h'), 'feet': (55, 'h')}
 VALUES = np.array([[0.0, 1.0, 100.0, -3.0], [7.0, -118.0, 64.0, 2.0], [5.0, 6.0, 7.0, 8.0]])
 FORMATS = {1: 'ibm', 2: 'i', 3: 'h', 5: 'f', 6: 'd', 8: 'b', 10: 'I', 11: 'H', 16: 'B'}
@@ -213,6 +199,12 @@ def test_times_that_are_utc_or_of_gps(tmp_path, base):
     assert read_segy(path).stamps[0] == (TEN - 18 * (base == 5)) * 10**9
     zone = read_segy(path, time_zone='+01:00').stamps[0]
     assert zone == (TEN - {0: 3600, 5: 18}.get(base, 0)) * 10**9
+
+
+@pytest.mark.parametrize(('year', 'whole'), [(21, 2021), (98, 1998)])
+def test_years_of_two_digits(tmp_path, year, whole):
+    line = read_segy(write(tmp_path / 'line.sgy', year=year))
+    assert line.stamps == read_segy(write(tmp_path / 'line.sgy', year=whole)).stamps
 
 
 def test_seconds_between_gps_and_utc():

@@ -15,6 +15,7 @@ import sys
 from helpers.sonar_files import place_of, side_scan, xtf_head, xtf_ping, xtf_soundings
 import numpy as np
 import pytest
+import yaml
 
 from msg_adapters.soundings import read_ground
 from sonar_imm.measurements import Detections, Navigation, Snapshot
@@ -80,6 +81,15 @@ class TestXtf:
         convert_xtf(path, tmp_path / 'bag', side='port', port_samples=order)
         (ping,) = read(tmp_path / 'bag', 'obstacle', Detections)
         assert ping.range == pytest.approx([(at + 0.5) * 0.1], abs=0.06)
+
+    @pytest.mark.parametrize('side, degrees', [('starboard', -90.0), ('port', 90.0)])
+    def test_the_narrow_high_beam_looks_abeam(self, tmp_path, side, degrees):
+        path = xtf(tmp_path / 'a.xtf', [xtf_ping(0.0, [echo(300), echo(300)])])
+        convert_xtf(path, tmp_path / 'bag', side=side)
+        given = yaml.safe_load((tmp_path / 'bag' / 'parameters.yaml').read_text())
+        (given,) = (each['ros__parameters'] for each in given.values())
+        assert given['sonar_mount_rpy_deg'] == [0.0, 0.0, degrees]
+        assert (given['horizontal_fov_deg'], given['vertical_fov_deg']) == (3.0, 80.0)
 
     def test_degrees_that_a_file_calls_metres_are_asked(self, tmp_path):
         path = side_scan(tmp_path / 'a.xtf')

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from sonar_imm_tools.recordings.convert import convert_fixes, convert_truth
-from sonar_imm_tools.recordings.csv_table import CsvOptions
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.tables import CsvOptions
 
 ROWS = [
     ('anna', '2024-05-31T10:00:00Z', 54.1, 10.1, -3.0),

@@ -38,19 +38,11 @@ def write_line(path):
     for layer in LAYERS:
         traces += 3000.0 * np.exp(-0.5 * np.square((sample - layer[:, None]) / 1.5))
     return write_segy(
-        path,
-        np.round(traces),
-        3,
-        TRACE_SAMPLE_INTERVAL=533,
-        YearDataRecorded=2018,
-        DayOfYear=72,
-        SecondOfMinute=rows // STACK,
-        SourceGroupScalar=-1000,
-        CoordinateUnits=2,
-        SourceX=round(-91.64 * 3.6e6) + 40 * (rows // STACK),
-        SourceY=round(17.13 * 3.6e6),
+        path, np.round(traces), 3, TRACE_SAMPLE_INTERVAL=533, YearDataRecorded=2018, DayOfYear=72,
+        SecondOfMinute=rows // STACK, SourceGroupScalar=-1000, CoordinateUnits=2,
+        SourceX=round(-91.64 * 3.6e6) + 40 * (rows // STACK), SourceY=round(17.13 * 3.6e6),
         CDP=500 + rows,
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture(scope='module')

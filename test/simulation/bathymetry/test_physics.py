@@ -17,14 +17,9 @@ from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 TILT, SPACING, STAVES, NOISE = 37.0, 0.37, 5, 2.5
 ODD = {
-    'tilt_deg': TILT,
-    'spacing_wavelengths': SPACING,
-    'staves': STAVES,
-    'noise_variance': NOISE,
-    'sonar_height': 13.0,
-    'snr_near_db': 9.0,
-    'snr_far_db': 9.0,
-}
+    'tilt_deg': TILT, 'spacing_wavelengths': SPACING, 'staves': STAVES, 'noise_variance': NOISE,
+    'sonar_height': 13.0, 'snr_near_db': 9.0, 'snr_far_db': 9.0,
+}  # fmt: skip
 SIGNAL = NOISE * 10.0**0.9
 
 
@@ -127,3 +122,14 @@ def test_the_first_pings_do_not_depend_on_how_many_follow():
     for (first, true), (other, same_true) in zip(few, many):
         assert np.array_equal(first.iq, other.iq) and np.array_equal(true.height, same_true.height)
     assert not np.array_equal(few[0][0].iq, few[1][0].iq)
+
+
+@pytest.mark.parametrize('decorrelation', [0.0, 0.4])
+def test_decorrelation_takes_from_the_common_wave_and_leaves_the_power(decorrelation):
+    products = []
+    for snapshot, true in run(40, decorrelation=decorrelation):
+        echo = snapshot.iq * np.exp(-1j * phases(true))
+        products.append(echo.T @ echo.conj() / len(echo))
+    covariance = np.mean(products, axis=0)
+    assert np.trace(covariance).real / STAVES == pytest.approx(SIGNAL + NOISE, rel=0.05)
+    assert covariance[0, 1].real == pytest.approx((1.0 - decorrelation) * SIGNAL, rel=0.05)

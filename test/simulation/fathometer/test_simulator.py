@@ -126,17 +126,10 @@ def test_whitened_spectra_are_even():
 
 
 ODD = {
-    'level': 'csdm',
-    'records': 1,
-    'phones': 5,
-    'element_spacing': 0.31,
-    'sound_speed': 1480.0,
-    'snapshot_seconds': 0.05,
-    'frequency_min': 150.0,
-    'frequency_max': 900.0,
-    'phone_noise': 0.02,
+    'level': 'csdm', 'records': 1, 'phones': 5, 'element_spacing': 0.31, 'sound_speed': 1480.0,
+    'snapshot_seconds': 0.05, 'frequency_min': 150.0, 'frequency_max': 900.0, 'phone_noise': 0.02,
     'ship_noise': 1.7,
-}
+}  # fmt: skip
 LAYERS = np.array([9.0, 12.5]), np.array([0.4, 0.2])
 """Heights of the lowest hydrophone above the layers, m, and their amplitudes."""
 
@@ -229,20 +222,11 @@ def test_pressure_has_the_spectra_of_the_plane_waves():
     config = scenario(
         'pressure',
         {
-            'phones': 4,
-            'element_spacing': 0.5,
-            'sample_rate': 4000.0,
-            'frequency_max': 1000.0,
-            'records': 1,
-            'record_seconds': 9.8,
-            'whitened': False,
-            'array_depth_std': 0.0,
-            'phone_noise': 0.01,
-            'first_depth': 45.0,
-            'layers': 1,
-            'ship_noise': 0.0,
+            'phones': 4, 'element_spacing': 0.5, 'sample_rate': 4000.0, 'frequency_max': 1000.0,
+            'records': 1, 'record_seconds': 9.8, 'whitened': False, 'array_depth_std': 0.0,
+            'phone_noise': 0.01, 'first_depth': 45.0, 'layers': 1, 'ship_noise': 0.0,
         },
-    )
+    )  # fmt: skip
     scene = simulate(config, 3)
     p = np.concatenate([item.measurement.pressure for item in scene.measurements])
     assert p.shape == (round(9.8 * 4000.0), 4)

@@ -9,6 +9,7 @@
 """Obstacle scenes: the same for the same seed, and physically what they say."""
 
 from functools import cache
+import math
 
 from helpers.scenes import smaller_scene
 import numpy as np
@@ -30,14 +31,9 @@ from sonar_imm_tools.simulation.obstacle.simulator import (
 )
 
 EXACT = {
-    'ideal_navigation': True,
-    'sound_speed_error': 0.0,
-    'range_std': 0.0,
-    'bearing_std_deg': 0.0,
-    'range_step': 0.0,
-    'bearing_step_deg': 0.0,
-    'navigation_rate': 50.0,
-}
+    'ideal_navigation': True, 'sound_speed_error': 0.0, 'range_std': 0.0, 'bearing_std_deg': 0.0,
+    'range_step': 0.0, 'bearing_step_deg': 0.0, 'navigation_rate': 50.0,
+}  # fmt: skip
 
 
 def of(scene, kind):
@@ -124,14 +120,9 @@ def test_pings_are_lost_and_navigation_has_gaps():
 
 LEVER, MOUNT = np.array([1.3, -0.4, 0.7]), (4.0, -3.0, 6.0)
 TURNED = {
-    **EXACT,
-    'altitude_std': 0.0,
-    'sonar_lever': tuple(LEVER),
-    'sonar_mount_rpy_deg': MOUNT,
-    'course_deg': 70.0,
-    'roll_rms_deg': 4.0,
-    'vertical_offset': -4.0,
-}
+    **EXACT, 'altitude_std': 0.0, 'sonar_lever': tuple(LEVER), 'sonar_mount_rpy_deg': MOUNT,
+    'course_deg': 70.0, 'roll_rms_deg': 4.0, 'vertical_offset': -4.0,
+}  # fmt: skip
 
 
 def run(name='approach', seed=1, **overrides):
@@ -295,14 +286,9 @@ def test_false_echoes_fill_the_sector_evenly():
 # -- navigation -----------------------------------------------------------------------------------
 
 SILENT = {
-    'log_scale_error': 0.0,
-    'log_bias': 0.0,
-    'log_noise': 0.0,
-    'attitude_std_deg': 0.0,
-    'attitude_bias_deg': 0.0,
-    'yaw_bias_deg': 0.0,
-    'depth_std': 0.0,
-}
+    'log_scale_error': 0.0, 'log_bias': 0.0, 'log_noise': 0.0, 'attitude_std_deg': 0.0,
+    'attitude_bias_deg': 0.0, 'yaw_bias_deg': 0.0, 'depth_std': 0.0,
+}  # fmt: skip
 
 
 def path(seed, **errors):
@@ -484,3 +470,37 @@ def test_what_sways_has_its_deviation_and_forgets_in_its_time():
     assert ways.std() == pytest.approx(0.5, rel=0.03)
     lag = round(2.0 / _SWAY_STEP)
     assert np.mean(ways[:, lag:] * ways[:, :-lag]) / 0.25 == pytest.approx(np.exp(-1.0), abs=0.05)
+
+
+def test_the_vehicle_sways_across_its_course_and_dives_as_asked():
+    still = {'heave_rms': 0.0, 'roll_rms_deg': 0.0, 'pitch_rms_deg': 0.0, 'yaw_rms_deg': 0.0}
+    config = scenario(
+        'approach', {**EXACT, **still, 'sway_rms': 2.0, 'course_deg': 40.0, 'dive': 3.0}
+    )
+    poses = of(simulate(config, 3), Navigation)
+    t = np.array([pose.stamp_ns for pose in poses]) * 1e-9
+    t -= t[0]
+    east, north, up = (np.array([pose.position for pose in poses]) - poses[0].position).T
+    s, c = np.sin(np.radians(40.0)), np.cos(np.radians(40.0))
+    assert_allclose(north * c + east * s, config.speed * t, atol=1e-6)
+    across = east * c - north * s
+    assert 0.5 < np.std(across) < 6.0
+    dive = np.sin(2.0 * np.pi * t / 60.0)  # pings begin a little later than navigation
+    assert_allclose(up, -3.0 * dive, atol=0.7)
+
+
+def test_an_echo_to_port_has_a_positive_bearing():
+    scene = simulate(scenario('approach', {**EXACT, 'passing_distance': 8.0}), 4)
+    truth = scene.truth[0]
+    poses = of(scene, Navigation)
+    stamps = np.array([pose.stamp_ns for pose in poses])
+    seen = 0
+    for ping in of(scene, Detections):
+        pose = poses[int(np.argmin(np.abs(stamps - ping.stamp_ns)))]
+        place = truth.position[truth.stamp_ns.tolist().index(ping.stamp_ns)]
+        R = geometry.rotation_of_quaternion(pose.orientation)
+        x, y, _ = R.T @ (place - pose.position)
+        if len(ping) == 1 and abs(y) > 1.0:
+            assert ping.bearing[0] == pytest.approx(math.atan2(y, x), abs=0.1)
+            seen += 1
+    assert seen > 10

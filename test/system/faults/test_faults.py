@@ -58,7 +58,7 @@ def test_a_fault_is_survived_counted_and_said(fault, system, rigs, figures):
         fresh = Rig(CASES[system], fault.arguments)
         rigs[key] = fresh, fresh.undisturbed()
     rig, expected = rigs[key]
-    outcome = rig.suffer(fault.disturb(CASES[system]), expected)
+    outcome = rig.suffer(fault.disturb, expected)
     limit = CASES[system].settle if fault.settle is None else fault.settle
     figures.add(
         {'fault': fault.name, 'system': system},

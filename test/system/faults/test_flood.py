@@ -96,17 +96,12 @@ def flooded(case: Case, max_wait: float, *, times: float, seconds: float) -> Flo
         after = given.counts() - before
         waits = np.array([*given.latency.values()])
         return Flood(
-            capacity=1.0 / usual,
-            rate=len(many) / (ended - start),
-            sent=len(given.sent),
-            used=after['received'] - after['dropped'],
-            dropped=after['dropped'],
-            lost=after['lost'],
-            latency_max=float(waits.max()),
-            latency_p50=float(np.median(waits)),
-            recovered=float(recovered),
+            capacity=1.0 / usual, rate=len(many) / (ended - start), sent=len(given.sent),
+            used=after['received'] - after['dropped'], dropped=after['dropped'],
+            lost=after['lost'], latency_max=float(waits.max()),
+            latency_p50=float(np.median(waits)), recovered=float(recovered),
             warned='WARN' in rig.diagnostics.levels,
-        )
+        )  # fmt: skip
 
 
 class Sent:

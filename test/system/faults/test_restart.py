@@ -110,13 +110,8 @@ def test_a_node_that_is_killed_goes_on_with_ids_and_covariances(
         alone = final(system, undisturbed.play(messages[stop - again + 1 :]))
         forgotten += sum(not same(alone[stamp], whole[stamp]) for stamp in second)
     figures.add(
-        {'system': system},
-        tried=TURNS,
-        again=again - 1,
-        estimates=given,
-        equal=equal,
-        changed_without=forgotten,
-        wrong=wrong,
-    )
+        {'system': system}, tried=TURNS, again=again - 1, estimates=given, equal=equal,
+        changed_without=forgotten, wrong=wrong,
+    )  # fmt: skip
     assert not wrong
     assert forgotten or system in FORGETFUL

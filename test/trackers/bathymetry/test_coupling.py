@@ -83,7 +83,7 @@ def test_favours_act_as_a_prior_of_each_bin(engine):
         engine=engine,
         particles_per_model=20_000,
         smoothing='none',
-        shadow_gate=False,
+        gate_false_alarm=1.0,
         grid_extent=4.0,
     )
     T = 6

@@ -128,7 +128,7 @@ def test_decorrelation_is_noise_that_grows_with_the_echo():
         model_set='height_two_rw',
         decorrelation=0.25,
         engine='grid',
-        shadow_gate=False,
+        gate_false_alarm=1.0,
         sound_speed_std=2.0,
     )
     each = BathymetryTracker(given).process(ping)[0]

@@ -13,13 +13,11 @@ from types import SimpleNamespace
 
 import numpy as np
 from oracles import imm_particles as oracle
-from oracles.markov import stationary_law
 import pytest
 from scipy import stats
 
 from sonar_imm.acoustics import interference, laplace, rays
 from sonar_imm.acoustics.laplace import likelihood_table
-from sonar_imm.estimation import particles
 from sonar_imm.trackers.bathymetry import grid_kernels as kernels
 from sonar_imm.trackers.bathymetry import ping
 from sonar_imm.trackers.bathymetry.filter_kernels import normals
@@ -195,14 +193,6 @@ def test_resampling_draws_from_the_exact_mixture():
     assert oracle.resample(x, w, mu, ASYMMETRIC, rng.random(3))[1] == pytest.approx(c)
 
 
-def test_a_model_that_nothing_can_become_stays_finite():
-    rng = np.random.default_rng(4)
-    x, w, mu = random_set(rng)
-    closed = np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [1.0, 0.0, 0.0]])
-    mixed, c = oracle.resample(x, w, mu, closed, rng.random(3))
-    assert c[2] == 0.0 and np.isfinite(mixed).all()
-
-
 @pytest.mark.parametrize('tiny', [5e-324, 1e-310, 1e-300, 1e-280])
 def test_a_model_that_hardly_anything_can_become_stays_finite(tiny):
     """The reciprocal of its probability overflows, and numbers particles outside of the set."""
@@ -216,57 +206,6 @@ def test_a_model_that_hardly_anything_can_become_stays_finite(tiny):
     case = make_case([True], mu=mu)
     for found, expected in zip(compiled(case), in_numpy(case)):
         assert np.array_equal(found, expected)
-
-
-def test_without_likelihood_the_chain_finds_its_stationary_law():
-    rng = np.random.default_rng(5)
-    x, w, mu = random_set(rng)
-    for _ in range(300):
-        x, c = oracle.resample(x, w, mu, ASYMMETRIC, rng.random(3))
-        step = oracle.weigh(np.zeros((3, 50)), c)
-        w, mu = step.w, step.mu
-    assert mu == pytest.approx(stationary_law(ASYMMETRIC), abs=1e-9)
-
-
-def test_likelihood_of_a_model_is_the_weighted_mean():
-    w = np.array([[0.9, 0.1], [0.5, 0.5]])
-    q = np.array([[1.0, 3.0], [2.0, 6.0]])
-    step = oracle.weigh(np.log(q), np.array([0.25, 0.75]), w)
-    L = (w * q).sum(axis=1)
-    assert step.mu == pytest.approx(np.array([0.25, 0.75]) * L / (0.25 * L[0] + 0.75 * L[1]))
-    assert step.w == pytest.approx(w * q / L[:, None])
-    assert step.log_likelihood == pytest.approx(np.log(0.25 * L[0] + 0.75 * L[1]))
-
-
-@pytest.mark.parametrize('value', [-np.inf, np.nan])
-def test_the_prediction_is_kept_when_nothing_is_possible(value):
-    rng = np.random.default_rng(6)
-    _, w, mu = random_set(rng)
-    step = oracle.weigh(np.full((3, 50), value), mu, w)
-    assert not step.ok and np.array_equal(step.w, w) and np.array_equal(step.mu, mu)
-
-
-def test_a_model_whose_particles_are_impossible_loses_all_probability():
-    log_likelihood = np.zeros((2, 4))
-    log_likelihood[1] = -np.inf
-    step = oracle.weigh(log_likelihood, np.array([0.1, 0.9]))
-    assert step.mu.tolist() == [1.0, 0.0] and (step.w == 0.25).all()
-
-
-def test_the_summary_is_the_moments_of_the_union():
-    rng = np.random.default_rng(7)
-    x, w, mu = random_set(rng)
-    union, weight = np.moveaxis(x, 1, 0).reshape(2, -1), (mu[:, None] * w).ravel()
-    mean, covariance = oracle.summarise(x, w, mu)
-    assert mean == pytest.approx(np.average(union, axis=1, weights=weight))
-    assert covariance == pytest.approx(np.cov(union, aweights=weight, ddof=0))
-
-
-def test_effective_sample_size_is_the_mean_over_models():
-    rng = np.random.default_rng(8)
-    _, w, mu = random_set(rng)
-    expected = mu @ particles.effective_sample_size(w)
-    assert oracle.effective_sample_size(w, mu) == pytest.approx(expected)
 
 
 @pytest.fixture(scope='module')

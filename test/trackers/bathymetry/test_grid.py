@@ -9,13 +9,12 @@
 """Point masses: Kalman filter and smoother, the dense form, and the kernels on windows."""
 
 import numpy as np
-from oracles.grid import filter_densities, smooth_densities, walk_matrix
+from oracles.grid import filter_densities, walk_matrix
 import pytest
 
 from sonar_imm.trackers.bathymetry import grid_kernels as grid
 
 CELLS = np.arange(-400, 401) * 0.05
-STEP = 0.05
 ASYMMETRIC = np.array([[0.95, 0.05], [0.3, 0.7]])
 
 
@@ -31,42 +30,6 @@ def start(weights, std=1.0):
 def measurements(rng, T=25, std=0.3):
     z = np.cumsum(rng.normal(size=T) * 0.2) + rng.normal(size=T) * std
     return z, -0.5 * np.square((z[:, None] - CELLS) / std)
-
-
-def test_one_model_is_the_kalman_filter_and_smoother():
-    rng = np.random.default_rng(1)
-    z, log_likelihood = measurements(rng)
-    q, r = 0.2, 0.3
-    filtered = filter_densities(
-        start([1.0]), np.eye(1), np.full((len(z), 1), q / STEP), log_likelihood
-    )
-    smoothed = smooth_densities(
-        filtered.density, np.eye(1), np.full((len(z), 1), q / STEP), log_likelihood
-    )
-    m, P, passes = 0.0, 1.0, []
-    for value in z:
-        P += q**2
-        K = P / (P + r**2)
-        m, P = m + K * (value - m), (1.0 - K) * P
-        passes.append((m, P))
-    for density, (mean, variance) in zip(filtered.density[:, 0], passes):
-        assert density @ CELLS == pytest.approx(mean, abs=1e-9)
-        assert density @ np.square(CELLS - mean) == pytest.approx(variance, rel=1e-7)
-    for k in range(len(z) - 2, -1, -1):
-        mean, P = passes[k]
-        gain = P / (P + q**2)
-        m = mean + gain * (m - mean)
-        assert smoothed[k, 0] @ CELLS == pytest.approx(m, abs=1e-8)
-
-
-def test_identical_models_leave_the_chain_alone():
-    _, log_likelihood = measurements(np.random.default_rng(2), T=6)
-    sigma = np.full((6, 2), 4.0)
-    density = filter_densities(start([0.8, 0.2]), ASYMMETRIC, sigma, log_likelihood).density
-    mu = np.array([0.8, 0.2])
-    for step in density:
-        mu = mu @ ASYMMETRIC
-        assert step.sum(axis=1) == pytest.approx(mu, abs=1e-12)
 
 
 @pytest.mark.parametrize('sigma', [0.0, 0.7, 3.0, 11.9, 12.0, 20.0, 75.5])
@@ -127,32 +90,6 @@ def test_an_impossible_measurement_keeps_the_prediction(value):
     before = p.copy()
     assert grid.weigh(p, 0, 801, np.full(801, value), np.empty((2, 801))) == -np.inf
     assert p == pytest.approx(before)
-
-
-def test_the_smoother_is_the_sum_over_all_paths():
-    """Three cells, two models, three steps: every path of cells and models, one by one."""
-    rng = np.random.default_rng(5)
-    G, M, T = 3, 2, 3
-    p0 = rng.dirichlet(np.ones(M * G)).reshape(M, G)
-    sigma, log_likelihood = rng.uniform(0.4, 1.0, (T, M)), rng.normal(size=(T, G))
-    total = np.zeros((T, M, G))
-    states = [(i, g) for i in range(M) for g in range(G)]
-    walks = [[walk_matrix(G, sigma[t, j]) for j in range(M)] for t in range(T)]
-    for s0 in states:
-        for s1 in states:
-            for s2 in states:
-                for s3 in states:
-                    weight, path = p0[s0], (s0, s1, s2, s3)
-                    for t in range(T):
-                        (i, g), (j, h) = path[t], path[t + 1]
-                        weight *= ASYMMETRIC[i, j] * walks[t][j][g, h]
-                        weight *= np.exp(log_likelihood[t, h])
-                    for t in range(T):
-                        total[t][path[t + 1]] += weight
-    total /= total.sum(axis=(1, 2), keepdims=True)
-    density = filter_densities(p0, ASYMMETRIC, sigma, log_likelihood).density
-    assert density[-1] == pytest.approx(total[-1])
-    assert smooth_densities(density, ASYMMETRIC, sigma, log_likelihood) == pytest.approx(total)
 
 
 @pytest.mark.parametrize('sigma', [0.05, 0.3, 0.49])

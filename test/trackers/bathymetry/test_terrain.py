@@ -120,7 +120,7 @@ def of_several(terrain, mean, std):
 
 def seen(iq, ranges, rho, **config):
     return look(
-        Ping(evolve(TERRAIN, shadow_gate=False, **config), snapshot(iq, ranges, rho), None)
+        Ping(evolve(TERRAIN, gate_false_alarm=1.0, **config), snapshot(iq, ranges, rho), None)
     )
 
 

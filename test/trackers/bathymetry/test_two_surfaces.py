@@ -117,7 +117,7 @@ def test_existence_and_heights_of_the_prototype(monkeypatch):
         known = dict(archive)
     parts = known['iq'].astype(np.float32)
     iq = parts[..., 0] + 1j * parts[..., 1]
-    config = BathymetryConfig(layover='resolved', shadow_gate=False)
+    config = BathymetryConfig(layover='resolved', gate_false_alarm=1.0)
     off, inside = [], []
     for k, chain in enumerate(known['existence_chain']):
         noise = np.ones(1200)
@@ -222,7 +222,7 @@ def test_heights_out_of_reach_are_no_trouble():
     ranges = 14.0 + 0.02 * np.arange(120)  # the first ones end above the floor
     snapshot = floor(0.0, ranges=ranges + 1.1)
     snapshot = evolve(snapshot, range=ranges)
-    config = BathymetryConfig(layover='resolved', shadow_gate=False)
+    config = BathymetryConfig(layover='resolved', gate_false_alarm=1.0)
     seen = look(Ping(config, snapshot, None))
     everywhere = layover.Layover(np.ones(120), 0.0, np.ones(120, bool))
     geometry = seen.swath.geometry
@@ -300,7 +300,6 @@ def test_surface_echoes_leave_layover_alone():
     'staves, values',
     [
         (8, {}),
-        (8, {'model_set': 'height_bank'}),
         (8, {'model_set': 'height_two_rw', 'engine': 'grid'}),
         (3, {}),
     ],

@@ -78,28 +78,3 @@ def test_log_likelihood_of_each_bin(engine, tolerance):
     constant = np.log(2.0) - 8.0 * np.log(np.pi) - np.log1p(8.0 * case['rho'])
     error = estimate.extras['log_likelihood'] - constant - case['lev']
     assert np.abs(error).mean() < tolerance
-
-
-def test_identical_models_leave_the_chain_at_its_prediction():
-    """At the first bin both models of set_iii have the same noise."""
-    _, config, snapshot = vector('set_iii_0')
-    estimate = run(evolve(config, engine='grid'), snapshot)
-    assert estimate.probabilities[0] == pytest.approx([0.796, 0.204], abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    'wrong',
-    [
-        {'transition_matrix': (0.9, 0.1, 0.03, 0.97)},
-        {'sigmas': (0.0001, 1.0)},
-        {'tilt_deg': 30.2},
-        {'likelihood': 'gaussian'},
-        {'conjugate': True},
-    ],
-    ids=lambda wrong: next(iter(wrong)),
-)
-def test_wrong_filters_are_found_out(wrong):
-    """The vectors can fail: each mistake exceeds the tolerance of the right filter."""
-    case, config, snapshot = vector('set_ii_0')
-    deviation, dmu = errors(case, run(evolve(config, engine='grid', **wrong), snapshot))
-    assert deviation.mean() > 0.1 or dmu.mean() > 0.02

@@ -92,7 +92,7 @@ def lines_and_health(snapshot, **values):
     return [line for line in tracker.warnings() if 'same phase' in line], tracker.health()
 
 
-@pytest.mark.parametrize('values', [{}, {'shadow_gate': False}, {'tilt_deg': 0.0}])
+@pytest.mark.parametrize('values', [{}, {'gate_false_alarm': 1.0}, {'tilt_deg': 0.0}])
 @pytest.mark.parametrize('P', [2, 4, 8])
 def test_a_signal_common_to_the_staves_is_said(P, values):
     clean = floor(0.0, snr_db=10.0, P=P, ranges=15.5 + 0.05 * np.arange(600))
@@ -107,7 +107,7 @@ def test_so_is_what_the_staves_of_one_card_share():
     cards = [
         shared(clean, 30.0, seed).iq[:, part] for seed, part in ((5, np.s_[:4]), (6, np.s_[4:]))
     ]
-    lines, _ = lines_and_health(evolve(clean, iq=np.hstack(cards)), shadow_gate=False)
+    lines, _ = lines_and_health(evolve(clean, iq=np.hstack(cards)), gate_false_alarm=1.0)
     assert len(lines) == 1
 
 

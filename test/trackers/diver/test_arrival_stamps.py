@@ -11,10 +11,10 @@
 from pathlib import Path
 
 from attrs import evolve
+from helpers.diver_runs import arrivals
 import numpy as np
 import pytest
 
-from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver.arrival_stamps import ArrivalStamps, Resolution
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
@@ -43,17 +43,13 @@ def heard(step, count=60, seed=1, period=3.7, active=False):
         stamp = start if active else int(at.min())
         yield (
             place[:2],
-            Arrivals(
-                stamp_ns=stamp,
-                frame_id='map',
+            arrivals(
+                stamp,
+                RECEIVERS,
+                (at - (0 if active else stamp)) / 1000000000.0,
                 tx_id=np.full(n, 1),
                 rx_id=np.arange(1, n + 1),
                 tx=np.tile(RECEIVERS[0], (n, 1)) if active else np.full((n, 3), np.nan),
-                rx=RECEIVERS,
-                toa=(at - (0 if active else stamp)) / 1e9,
-                var_toa=np.full(n, 1e-8),
-                bearing=np.full(n, np.nan),
-                var_bearing=np.full(n, np.nan),
             ),
         )
 

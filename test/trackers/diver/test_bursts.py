@@ -12,12 +12,12 @@
 from pathlib import Path
 
 from attrs import evolve
-from helpers.diver_runs import SECOND
+from helpers.diver_runs import fix, SECOND
 import numpy as np
 import pytest
 
 from sonar_imm.estimation import bank
-from sonar_imm.measurements import Fix, Fixes
+from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver import bursts
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
@@ -114,13 +114,7 @@ def test_odds_of_the_two_readings():
 def fixes(t, z, R, **more):
     """Fixes z (n, 2) at t (n,), s."""
     for stamp, place, covariance in zip(t, z, R):
-        yield Fix(
-            stamp_ns=round((1.0 + stamp) * SECOND),
-            position=np.array([*place, 0.0]),
-            covariance=covariance,
-            frame_id='map',
-            **more,
-        )
+        yield evolve(fix(1.0 + stamp, *place, covariance), **more)
 
 
 def test_two_bursts_are_those_of_the_prototype():
@@ -253,6 +247,26 @@ def test_a_burst_that_follows_another_one_takes_no_identity():
     assert before[0] == ids and len(ids) == 1
     assert np.hypot(*(place[0] - truth[-1, 0])) < 3.0
     assert all(confirmed(each)[0] == ids for each in made[40:])
+
+
+def test_a_burst_excludes_a_track_though_its_second_fix_is_missing():
+    """The track that the first fix begins does not end before the burst, or a new target would be
+    lost to it."""
+    t = np.arange(60.0)
+    truth = np.column_stack([0.5 * t - 20.0, 0.0 * t])[:, None]
+    seen = truth.copy()
+    seen[40:48, 0] += [15.0, -20.0]
+    seen[41, 0] = np.nan
+    tracker, excluded = DiverTracker(DiverConfig()), 0
+    for scan in scans(seen, seed=1):
+        made = tracker.process(scan)[-1]
+        known = tracker._stream.state
+        link = known.rows.key['link']
+        assert np.isin(link[link != 0], known.life.track_id).all()
+        excluded += (link > 0).any()
+    assert excluded >= 8
+    _, (place,) = confirmed(made)
+    assert np.hypot(*(place - truth[-1, 0])) < 3.0
 
 
 def test_two_false_fixes_that_agree_are_not_said():

@@ -10,12 +10,12 @@
 
 from pathlib import Path
 
-from helpers.diver_runs import SECOND
+from attrs import evolve
+from helpers.diver_runs import scan_of, SECOND
 from helpers.estimates import same
 import numpy as np
 import pytest
 
-from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver.clutter import (
     Clutter,
     Clutters,
@@ -40,13 +40,7 @@ def scans(count, false, half, seed=11, divers=((0.0, 0.0), (0.0, 2.0)), aspect=1
         there = there[rng.uniform(size=len(there)) < 0.9]
         wild = rng.uniform(-half, half, (rng.poisson(false), 2)) * (1.0, aspect)
         both = np.concatenate([there + rng.normal(scale=0.5, size=there.shape), wild])
-        found.append(
-            Fixes(
-                stamp_ns=second * SECOND,
-                position=np.column_stack([both, np.zeros(len(both))]),
-                covariance=np.tile(0.25 * np.eye(2), (len(both), 1, 1)),
-            )
-        )
+        found.append(scan_of(second, both))
     return found
 
 
@@ -89,27 +83,12 @@ def test_what_is_stated_stays_and_gnn_learns_nothing():
 
 
 def test_each_sensor_has_its_own():
-    tracker = DiverTracker(
-        DiverConfig.from_mapping(
-            {
-                'association': 'jipda',
-                'model_set': 'heading_speed',
-                'directions': 4,
-                'sensors': ['left', 'right'],
-                'right.clutter_density': 3e-5,
-            }
-        )
-    )
+    known = {'association': 'jipda', 'model_set': 'heading_speed', 'directions': 4}
+    known |= {'sensors': ['left', 'right'], 'right.clutter_density': 3e-5}
+    tracker = DiverTracker(DiverConfig.from_mapping(known))
     for item in scans(10, 4.0, 40.0):
         for sensor, late in (('left', 0), ('right', 1), ('', 2)):
-            tracker.process(
-                Fixes(
-                    stamp_ns=item.stamp_ns + late,
-                    position=item.position,
-                    covariance=item.covariance,
-                    sensor=sensor,
-                )
-            )
+            tracker.process(evolve(item, stamp_ns=item.stamp_ns + late, sensor=sensor))
     found = dict(tracker._stream.state.memory['clutter'].by_sensor)
     assert sorted(found) == ['', 'left']
 
@@ -212,10 +191,7 @@ def test_false_fixes_in_a_clump_begin_no_track_for_long():
         z = rng.normal(scale=3.0, size=(rng.poisson(0.8), 2))
         divers = np.array([[0.6 * second - 36.0, 9.0], [0.6 * second - 36.0, 50.0]])
         z = np.concatenate([z, divers + rng.normal(scale=0.5, size=(2, 2))])
-        position = np.column_stack([z, np.zeros(len(z))])
-        covariance = np.tile(0.25 * np.eye(2), (len(z), 1, 1))
-        item = Fixes(stamp_ns=second * SECOND, position=position, covariance=covariance)
-        (estimate,) = tracker.process(item)
+        (estimate,) = tracker.process(scan_of(second, z))
         firm = estimate.state[estimate.extras['track_state'] > 0, :2]
         own = [np.hypot(*(firm - diver).T).min(initial=9.0) < 2.0 for diver in divers]
         shown.append((*own, len(firm) - sum(own)))

@@ -9,13 +9,13 @@
 """Detection probability as a function of place: who leaves the sector is not missed in it."""
 
 from attrs import evolve
-from helpers.diver_runs import SECOND
+from helpers.diver_runs import scan_of, SECOND
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 from sonar_imm.estimation.bank import Gaussians
-from sonar_imm.measurements import Arrivals, Fixes
+from sonar_imm.measurements import Arrivals
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver import coverage, coverage_map
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
@@ -26,11 +26,7 @@ AHEAD = (0.0, 0.0, 0.0, 90.0, 0.0, 50.0)
 
 
 def scan(second, *places, sensor=''):
-    position = np.array([[x, y, 0.0] for x, y in places]).reshape(-1, 3)
-    covariance = np.tile(0.25 * np.eye(2), (len(position), 1, 1))
-    return Fixes(
-        stamp_ns=round(second * SECOND), position=position, covariance=covariance, sensor=sensor
-    )
+    return scan_of(second, places, sensor=sensor)
 
 
 def written(tmp_path, name, header, rows):

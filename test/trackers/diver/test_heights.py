@@ -11,6 +11,7 @@ a track that are spread over depth."""
 
 import math
 
+from helpers.diver_runs import arrivals
 import numpy as np
 import pytest
 
@@ -18,7 +19,7 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.estimation.gauss_markov import gauss_markov
 from sonar_imm.estimation.rows import LEAST_LOG
-from sonar_imm.measurements import Arrivals, Fix, Fixes, GeodeticFix, RelativeFix, Start
+from sonar_imm.measurements import Fix, Fixes, GeodeticFix, RelativeFix, Start
 from sonar_imm.trackers.diver.births import restart_track
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.depth import ambiguous_depths, respread_depths
@@ -224,16 +225,6 @@ def test_heights_that_are_wild_all_the_time_are_said():
     assert [text for text in tracker.warnings() if 'were rejected' in text]
 
 
-def test_late_fixes_give_the_bits_of_sorted_ones():
-    rng = np.random.default_rng(6)
-    fixes = [fix(k, -10.0 + rng.normal(), spatial(1.0, 0.4), 0.5 * k) for k in range(1, 15)]
-    late = [*fixes[:6], *fixes[7:10], fixes[6], *fixes[10:]]
-    config = DiverConfig(dimensions=3, max_tracks=1)
-    whole, replayed = last(DiverTracker(config), fixes), last(DiverTracker(config), late)
-    assert whole.state.tobytes() == replayed.state.tobytes()
-    assert whole.covariance.tobytes() == replayed.covariance.tobytes()
-
-
 @pytest.mark.parametrize('association', ['gnn', 'jipda'])
 def test_two_divers_have_two_depths(association):
     tracker = DiverTracker(DiverConfig(dimensions=3, association=association))
@@ -298,18 +289,8 @@ def banked(means, variances, weights, **settings):
 
 def pings(path_std=0.3):
     """A ping heard on one receiver beside the transmitter."""
-    nothing = [math.nan]
-    return Arrivals(
-        stamp_ns=2 * 10**9,
-        tx_id=[0],
-        rx_id=[0],
-        tx=[[18.0, 0.0, -3.0]],
-        rx=[[24.0, 0.0, -3.0]],
-        toa=[0.02],
-        var_toa=[(path_std / 1500.0) ** 2],
-        bearing=nothing,
-        var_bearing=nothing,
-    )
+    at, variance = [18.0, 0.0, -3.0], (path_std / 1500.0) ** 2
+    return arrivals(2 * 10**9, [[24.0, 0.0, -3.0]], [0.02], tx=at, var_toa=variance)
 
 
 def after_spread(state, models, tracker, path_std=0.3):

@@ -13,13 +13,12 @@ import subprocess
 import sys
 
 from attrs import evolve
-from helpers.diver_runs import read_only, run, SECOND
+from helpers.diver_runs import read_only, run, scan_of
 import numpy as np
 import pytest
 
 from sonar_imm.estimation import rows as table
 from sonar_imm.estimation.bank import Gaussians
-from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver import bursts
 from sonar_imm.trackers.diver.estimate import published_state
 from sonar_imm.trackers.diver.known import repair_covariances
@@ -34,15 +33,8 @@ SETS = [
 ]
 
 
-def scan(second, places, std=0.5, order=None):
-    position = np.pad(np.reshape(places, (-1, 2)), [(0, 0), (0, 1)])
-    order = np.arange(len(position)) if order is None else order
-    return Fixes(
-        stamp_ns=round(second * SECOND),
-        position=position[order],
-        covariance=np.tile(std**2 * np.eye(2), (len(position), 1, 1))[order],
-        frame_id='map',
-    )
+def scan(second, places, std=0.5):
+    return scan_of(second, places, std)
 
 
 def swims(divers, seconds, seed, apart=60.0, false=0.0, detected=0.9, scatter=1.0):

@@ -10,7 +10,6 @@
 
 from pathlib import Path
 
-from attrs import evolve
 import numpy as np
 import pytest
 
@@ -98,6 +97,8 @@ def test_headings_and_the_velocity_they_put_out():
     [
         ({'model_set': 'heading_sped'}, 'did you mean'),
         ({'depth_min': 30.0}, 'cannot exceed'),
+        ({'covariance_scales': (0.001, 1.0)}, 'covariance_scales'),
+        ({'covariance_scales': ()}, 'one value at least'),
         ({'transition_matrix': (0.5, 0.5)}, '37 x 37'),
         ({'model_set': 'heading_speed', 'transition_matrix': (0.5, 0.5)}, '17 x 17'),
         ({**TWO, 'transition_matrix': (0.9, 0.2, 0.5, 0.5)}, 'row 0 .* 1.1'),
@@ -126,7 +127,3 @@ def test_the_cache_of_steps_is_bounded():
     for k in range(1000):
         models.motion(1.0 + 1e-4 * k)
     assert len(models._cache) < 100
-
-
-def test_a_config_is_a_value():
-    assert evolve(DiverConfig(), directions=8) == DiverConfig(directions=8)

@@ -8,10 +8,12 @@
 
 """Names: of fixes, of tags' pings, of divers that are also seen without one."""
 
+from attrs import evolve
+from helpers.diver_runs import arrivals, fix, scan_of
 import numpy as np
 import pytest
 
-from sonar_imm.measurements import Arrivals, Fix, Fixes, NOBODY
+from sonar_imm.measurements import Fix, NOBODY
 from sonar_imm.trackers.diver.names import scans_to_merge
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
@@ -20,34 +22,12 @@ BOTH = ('gnn', 'jipda')
 RX = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
 
 
-def named(second, place, name, std=1.0):
-    return Fix(
-        stamp_ns=round(second * SECOND),
-        position=[*place, 0.0],
-        covariance=std**2 * np.eye(2),
-        target_id=name,
-        frame_id='map',
-    )
+def named(second, place, name):
+    return evolve(fix(second, *place), target_id=name)
 
 
-def scan(second, *places, std=0.5, **values):
-    n = len(places)
-    return Fixes(
-        stamp_ns=round(second * SECOND),
-        position=np.reshape([[*place, 0.0] for place in places], (n, 3)),
-        covariance=np.tile(std**2 * np.eye(2), (n, 1, 1)),
-        frame_id='map',
-        **values,
-    )
-
-
-def test_single_fixes_with_a_name_go_to_their_own_track():
-    tracker = DiverTracker(DiverConfig())
-    for second in range(1, 40):
-        name = 7 if second % 2 else 3
-        (estimate,) = tracker.process(named(second, (0.1 * name, 0.0), name))
-    assert sorted(estimate.extras['target_id'].tolist()) == [3, 7]
-    assert (estimate.extras['track_state'] > 0).all()
+def scan(second, *places, **values):
+    return scan_of(second, places, **values)
 
 
 def test_scans_needed_before_two_tracks_are_one_follow_from_p_d():
@@ -152,19 +132,7 @@ def ping(second, places, rng=None):
         tx_id += [number] * 4
         rx_id += range(4)
         rx += RX.tolist()
-    n = len(toa)
-    return Arrivals(
-        stamp_ns=round(second * SECOND),
-        tx_id=tx_id,
-        rx_id=rx_id,
-        tx=np.full((n, 3), np.nan),
-        rx=rx,
-        toa=toa,
-        var_toa=np.full(n, 1e-8),
-        bearing=np.full(n, np.nan),
-        var_bearing=np.full(n, np.nan),
-        frame_id='map',
-    )
+    return arrivals(round(second * SECOND), rx, toa, tx_id=tx_id, rx_id=rx_id)
 
 
 @pytest.mark.parametrize('together', [True, False])

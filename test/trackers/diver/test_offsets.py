@@ -9,11 +9,10 @@
 """Errors of arrivals that last: the evidence is what least squares over all pings says, whatever
 the motion, and what is stated of instruments is taken from it."""
 
-from helpers.diver_runs import fix, run
+from helpers.diver_runs import arrivals, fix, run
 import numpy as np
 import pytest
 
-from sonar_imm.measurements import Arrivals
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver import estimate, offsets
 from sonar_imm.trackers.diver.config import DiverConfig
@@ -34,6 +33,13 @@ def legs(place, tag=False):
     return reach if tag else reach + np.hypot(*place)
 
 
+def ping_of(place, tag=False, error=0.0, rows=slice(None)):
+    """The arrivals of a diver at `place` (2,) at the receivers `rows`, with errors (4,), m."""
+    toa = (legs(place, tag) + error)[rows] / SPEED
+    known = {'rx_id': np.arange(4)[rows], 'tx': [np.nan if tag else 0.0] * 3, 'var_toa': STD**2}
+    return arrivals(1, RECEIVERS[rows], toa, tx_id=np.ones(len(toa)), **known)
+
+
 def evidence(places, received, errors, tag=False, **stated):
     """The evidence of pings of a diver at `places` (k, 2) whose arrivals, those that were `heard`
     (k, 4), have the errors (k, 4), m of path."""
@@ -41,19 +47,8 @@ def evidence(places, received, errors, tag=False, **stated):
     models, found = build_models(config), BiasTest()
     layout = Instruments().layout(config, models)
     for place, rows, error in zip(places, received, errors):
-        n, tx = int(rows.sum()), [np.nan if tag else 0.0] * 3
-        ping = Arrivals(
-            stamp_ns=1,
-            tx_id=np.ones(n),
-            rx_id=np.flatnonzero(rows),
-            tx=np.tile(tx, (n, 1)),
-            rx=RECEIVERS[rows],
-            toa=(legs(place, tag) + error)[rows] / SPEED,
-            var_toa=np.full(n, STD**2),
-            bearing=np.full(n, np.nan),
-            var_bearing=np.full(n, np.nan),
-        )
-        seen = ping_measurements(ping, np.arange(n), config, models, layout)
+        ping = ping_of(place, tag, error, rows)
+        seen = ping_measurements(ping, np.arange(len(ping)), config, models, layout)
         ids = np.column_stack([ping.tx_id, ping.rx_id]).astype(np.int64)
         found = found.with_ping(seen, seen.echo, ids, place + [0.3, -0.2], config)
     return found, config
@@ -143,18 +138,7 @@ def test_pings_that_any_place_explains_say_nothing():
 def heard(config, place, tag=False):
     """The pairs heard in one ping, all of whose echoes were taken, of a diver at `place` (2,)."""
     models, everyone = build_models(config), np.ones(4, bool)
-    ping = Arrivals(
-        stamp_ns=1,
-        tx_id=np.ones(4),
-        rx_id=np.arange(4),
-        tx=np.tile([np.nan if tag else 0.0] * 3, (4, 1)),
-        rx=RECEIVERS,
-        toa=legs(place, tag) / SPEED,
-        var_toa=np.full(4, STD**2),
-        bearing=np.full(4, np.nan),
-        var_bearing=np.full(4, np.nan),
-    )
-    layout = Instruments().layout(config, models)
+    ping, layout = ping_of(place, tag), Instruments().layout(config, models)
     seen = ping_measurements(ping, np.arange(4), config, models, layout)
     at = np.asarray(place, float)
     nothing = BiasTest(), RecentPairs()
@@ -224,24 +208,13 @@ def test_what_is_assumed_moves_no_estimate_and_ends_with_fixes():
 
 
 def test_pairs_that_fell_silent_are_forgotten():
-    config = DiverConfig()
-    found = heard(config, np.array([20.0, 30.0]))
+    config, place = DiverConfig(), np.array([20.0, 30.0])
+    found = heard(config, place)
     nobody = found
     for _ in range(offsets.RECENT):
         nobody = nobody._replace(age=nobody.age + 1.0)
     models = build_models(config)
     layout = Instruments().layout(config, models)
-    ping = Arrivals(
-        stamp_ns=2,
-        tx_id=[1],
-        rx_id=[2],
-        tx=np.zeros((1, 3)),
-        rx=RECEIVERS[2:3],
-        toa=[0.1],
-        var_toa=[STD**2],
-        bearing=[np.nan],
-        var_bearing=[np.nan],
-    )
-    seen = ping_measurements(ping, np.arange(1), config, models, layout)
+    seen = ping_measurements(ping_of(place, rows=[2]), np.arange(1), config, models, layout)
     left = nobody.with_ping(seen, np.ones(1, bool), np.array([[1, 2]]))
     assert left.pairs == ((1, 2),) and len(found.pairs) == 4

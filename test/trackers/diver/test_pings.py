@@ -9,6 +9,7 @@
 """Pings as numbers and their updates: lists against the plain forms, order, quadrature."""
 
 from attrs import evolve
+from helpers.diver_runs import arrivals
 from helpers.sea_vectors import vectors
 import numpy as np
 from oracles.student_t import student_t_maximum
@@ -19,7 +20,7 @@ from msg_adapters.arrivals import MAX_PAIRS
 from sonar_imm.acoustics.arrivals_3d import BEARING, CLOCK, observe
 from sonar_imm.acoustics.localisation import localise
 from sonar_imm.estimation.covariance import are_sound
-from sonar_imm.measurements import Arrivals, Fix
+from sonar_imm.measurements import Fix
 from sonar_imm.trackers.diver.arrivals import (
     _start_positions,
     apply_updates,
@@ -138,19 +139,7 @@ def ping_of(position, receivers=RECEIVERS, tx=(0.0, 0.0, 0.0), std=2e-4, rng=Non
     if np.isfinite(tx).all():
         path = path + np.linalg.norm(position - np.array(tx))
     noise = np.zeros(n) if rng is None else std * rng.normal(size=n)
-    return Arrivals(
-        stamp_ns=10**9,
-        tx_id=np.zeros(n),
-        rx_id=np.arange(n),
-        tx=np.tile(tx, (n, 1)),
-        rx=receivers,
-        toa=path / 1500.0 + noise,
-        var_toa=np.full(n, std**2),
-        bearing=np.full(n, np.nan),
-        var_bearing=np.full(n, np.nan),
-        frame_id='map',
-        **more,
-    )
+    return arrivals(10**9, receivers, path / 1500.0 + noise, tx=tx, var_toa=std**2, **more)
 
 
 @pytest.mark.parametrize('passive', [False, True])
@@ -345,14 +334,13 @@ SECOND = 10**9
 def ping(rx, toa, stamp_ns=SECOND, tx=(np.nan,) * 3, var_toa=1e-9, **more):
     n = len(rx)
     columns = {'rx_id': np.arange(n), 'bearing': np.full(n, np.nan)} | more
-    return Arrivals(
-        stamp_ns=stamp_ns,
-        tx_id=np.zeros(n),
-        rx=rx,
-        tx=np.tile(tx, (n, 1)),
-        toa=toa,
-        var_toa=np.full(n, var_toa),
-        var_bearing=np.where(np.isnan(columns['bearing']), np.nan, 1e-4),
+    return arrivals(
+        stamp_ns,
+        rx,
+        toa,
+        tx=tx,
+        var_toa=var_toa,
+        var_bearing=np.where(np.isnan(columns['bearing']), np.nan, 0.0001),
         **columns,
     )
 
@@ -523,16 +511,12 @@ def sharp_pings(seed, passive, count=12):
         path = np.linalg.norm(diver - RECEIVERS, axis=1)
         path += 0.0 if passive else np.linalg.norm(diver)
         variance = 10.0 ** rng.uniform(-22, -7, size=4)
-        yield Arrivals(
-            stamp_ns=stamp,
-            tx_id=np.zeros(4),
-            rx_id=np.arange(4),
-            tx=np.tile(tx, (4, 1)),
-            rx=RECEIVERS,
-            toa=path / 1500.0 + np.sqrt(variance) * rng.normal(size=4),
+        yield arrivals(
+            stamp,
+            RECEIVERS,
+            path / 1500.0 + np.sqrt(variance) * rng.normal(size=4),
+            tx=tx,
             var_toa=variance,
-            bearing=np.full(4, np.nan),
-            var_bearing=np.full(4, np.nan),
         )
         stamp += int(10 ** rng.uniform(0.0, 9.3))
 

@@ -8,12 +8,11 @@
 
 """Tracks from pings of which one arrival is received."""
 
-from helpers.diver_runs import SECOND
+from helpers.diver_runs import arrivals, SECOND
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver import ranges, sides
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
@@ -25,18 +24,14 @@ def single(second, place, target, rng, std=STD):
     """The two-way range of a target from one place."""
     at = np.append(place, 0.0)[None]
     path = 2.0 * np.linalg.norm(np.append(target, 0.0) - at) + 2.0 * std * rng.normal()
-    nothing = np.full(1, np.nan)
-    return Arrivals(
-        stamp_ns=round(second * SECOND),
+    return arrivals(
+        round(second * SECOND),
+        at,
+        np.array([path / 1500.0]),
         tx_id=np.ones(1),
         rx_id=np.zeros(1),
         tx=at,
-        rx=at,
-        toa=np.array([path / 1500.0]),
-        var_toa=np.full(1, (2.0 * std / 1500.0) ** 2),
-        bearing=nothing,
-        var_bearing=nothing,
-        frame_id='map',
+        var_toa=(2.0 * std / 1500.0) ** 2,
     )
 
 

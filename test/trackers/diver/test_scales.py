@@ -117,12 +117,6 @@ def test_covariances_that_are_far_too_large_leave_the_mean_alone():
     assert 'covariances are too large' in tracker.warnings()[0]
 
 
-def test_true_covariances_are_not_warned_about():
-    items, truth = swim(6)
-    _, nees, tracker = scored(items, truth)
-    assert 1.0 < nees < 3.0 and not tracker.warnings()
-
-
 def test_a_new_track_has_no_rows_of_improbable_scales():
     tracker = DiverTracker(DiverConfig())
     items, _ = swim(7, count=3)

@@ -9,13 +9,13 @@
 """Scans: empty ones, soft association, and fixes that say whose they are."""
 
 from attrs import evolve
-from helpers.diver_runs import fix, read_only, run, SECOND
+from helpers.diver_runs import arrivals, fix, read_only, run, scan_of, SECOND
 from helpers.estimates import same
 import numpy as np
 import pytest
 
 from sonar_imm.estimation.association import TrackStatus
-from sonar_imm.measurements import Arrivals, Fixes, NOBODY
+from sonar_imm.measurements import Fixes, NOBODY
 from sonar_imm.trackers.diver import clutter, pairing, pruning
 from sonar_imm.trackers.diver import tracker as tracker_module
 from sonar_imm.trackers.diver.innovations import FixConsistency, MEMORY
@@ -29,14 +29,7 @@ ASSOCIATIONS = ('gnn', 'jipda')
 
 
 def scan(second, *places, ids=None, std=0.5):
-    position = np.array([[x, y, 0.0] for x, y in places]).reshape(-1, 3)
-    return Fixes(
-        stamp_ns=round(second * SECOND),
-        position=position,
-        covariance=np.tile(std**2 * np.eye(2), (len(position), 1, 1)),
-        target_id=ids,
-        frame_id='map',
-    )
+    return scan_of(second, places, std, target_id=ids)
 
 
 SEEDS = [0, *(pytest.param(k, marks=pytest.mark.statistics) for k in (1, 2, 3))]
@@ -49,12 +42,9 @@ def ids_of(estimate):
 def test_a_scan_is_the_same_as_its_fixes_one_by_one():
     scene = simulate(scenario('several', {'duration': 30.0}), seed=2)
     single = [item.measurement for item in scene.measurements]
-    stamps = sorted({item.stamp_ns for item in single})
     scans = []
-    for stamp in stamps:
-        own = sorted(
-            (item for item in single if item.stamp_ns == stamp), key=lambda item: item.key()
-        )
+    for stamp in sorted({item.stamp_ns for item in single}):
+        own = sorted((item for item in single if item.stamp_ns == stamp), key=lambda i: i.key())
         scans.append(
             Fixes(
                 stamp_ns=stamp,
@@ -64,7 +54,7 @@ def test_a_scan_is_the_same_as_its_fixes_one_by_one():
             )
         )
     first, other = (run(DiverTracker(DiverConfig()), items) for items in (single, scans))
-    assert len(first) == len(other) == len(stamps)
+    assert len(first) == len(other) == len(scans)
     assert all(same(*pair) for pair in zip(first, other))
 
 
@@ -158,19 +148,6 @@ def test_two_confirmed_tracks_on_one_diver_become_the_older_one():
         confirmed.append(confirmed_ids(estimate))
     assert confirmed[5] == [1, 2] and confirmed[14] == [1, 2]
     assert confirmed[-1] == [1]
-
-
-@pytest.mark.parametrize('association', ASSOCIATIONS)
-def test_late_scans_give_the_same_bits(association):
-    scene = simulate(scenario('crossing', {'duration': 25.0, 'clutter': 3.0}), seed=4)
-    items = [item.measurement for item in scene.measurements]
-    config = DiverConfig(
-        association=association, **scenario('crossing', {'clutter': 3.0}).instruments()
-    )
-    order = np.argsort(np.arange(len(items)) + np.random.default_rng(1).uniform(0, 8, len(items)))
-    first = run(DiverTracker(config), items)
-    other = run(DiverTracker(config), [items[k] for k in order])
-    assert all(same(*pair) for pair in zip(first, other)) and len(first) == len(other)
 
 
 @pytest.mark.statistics
@@ -294,18 +271,7 @@ def ping(second):
     """The echoes of a diver at (20, 30, -2) at four receivers."""
     rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
     leg = np.linalg.norm(rx - [20.0, 30.0, -2.0], axis=1)
-    return Arrivals(
-        stamp_ns=second * SECOND,
-        tx_id=np.zeros(4),
-        rx_id=np.arange(4),
-        tx=np.tile(rx[0], (4, 1)),
-        rx=rx,
-        toa=(leg + leg[0]) / 1500.0,
-        var_toa=np.full(4, 1e-8),
-        bearing=np.full(4, np.nan),
-        var_bearing=np.full(4, np.nan),
-        frame_id='map',
-    )
+    return arrivals(second * SECOND, rx, (leg + leg[0]) / 1500.0, tx=rx[0])
 
 
 @pytest.mark.parametrize('dimensions', [2, 3])
@@ -415,13 +381,7 @@ def beside_each_other(seed, seen, std=0.15, detection_probability=0.95, clutter=
         places = places[rng.uniform(size=count) < detection_probability]
         places = places + std * rng.normal(size=places.shape)
         false = [0.5 * second, 0.0] + rng.uniform(-25.0, 25.0, (rng.poisson(clutter), 2))
-        places = np.vstack([places, false])
-        yield Fixes(
-            stamp_ns=second * SECOND,
-            position=np.pad(places, [(0, 0), (0, 1)]),
-            covariance=np.tile(std**2 * np.eye(2), (len(places), 1, 1)),
-            frame_id='map',
-        )
+        yield scan_of(second, np.vstack([places, false]), std)
 
 
 def confirmed_by_jipda(scans, **values):

@@ -10,7 +10,6 @@
 
 from attrs import evolve
 from helpers.diver_runs import fix
-from helpers.estimates import same
 import numpy as np
 import pytest
 
@@ -149,23 +148,6 @@ def test_lasting_errors_of_fixes_are_in_the_covariance():
 def test_looking_back_is_better_and_as_true(name, config):
     forward, back = map(scores, zip(*runs_of(name, {}, config, range(3), smooth=True)))
     assert back[0] < forward[0] and back[1] < 2.6
-
-
-@pytest.mark.parametrize('config', [{'dimensions': 3, **OFF}, {'fix_bias_std': 1.0, **OFF}])
-def test_late_input_gives_the_same_bits(config):
-    made = simulate(scenario('at_depth', {'duration': 15.0}), 2)
-    received = [scan.measurement for scan in made.measurements]
-    received += [fix(received[0].stamp_ns * 1e-9 + second, 20.0, 30.0) for second in (3.5, 7.5)]
-    received.sort(key=lambda scan: scan.stamp_ns)
-    order = np.random.default_rng(1).permutation(len(received))
-    ends = []
-    for items in (received, [received[0], *(received[k] for k in order)]):
-        tracker, final = DiverTracker(DiverConfig(max_tracks=1, history=30.0, **config)), {}
-        for item in items:
-            final.update((e.stamp_ns, e) for e in tracker.process(item))
-        ends.append(final)
-    assert sorted(ends[0]) == sorted(ends[1])
-    assert all(same(ends[0][stamp], ends[1][stamp]) for stamp in ends[0])
 
 
 def run_fixes(total, white, bias, **config):

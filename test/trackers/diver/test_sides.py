@@ -11,12 +11,11 @@
 from pathlib import Path
 
 from attrs import evolve
-from helpers.diver_runs import fix, SECOND
+from helpers.diver_runs import arrivals, fix, SECOND
 import numpy as np
 import pytest
 
 from sonar_imm.estimation.bank import Gaussians
-from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver import sides
 from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.models import build_models
@@ -33,18 +32,14 @@ def ranges(second, position, rng, count, std=0.5):
     rx = RECEIVERS[:count].copy()
     rx[:, :2] = rx[:, :2] @ TURNED.T
     path = 2.0 * np.linalg.norm(np.append(position, 0.0) - rx, axis=1)
-    nothing = np.full(count, np.nan)
-    return Arrivals(
-        stamp_ns=round(second * SECOND),
+    return arrivals(
+        round(second * SECOND),
+        rx,
+        (path + 2.0 * std * rng.normal(size=count)) / 1500.0,
         tx_id=np.arange(count) + 1,
-        rx_id=np.arange(count),
         tx=rx,
-        rx=rx,
-        toa=(path + 2.0 * std * rng.normal(size=count)) / 1500.0,
-        var_toa=np.full(count, (2.0 * std / 1500.0) ** 2),
-        bearing=nothing,
-        var_bearing=nothing + 1e-2,
-        frame_id='map',
+        var_toa=(2.0 * std / 1500.0) ** 2,
+        var_bearing=0.01,
     )
 
 

@@ -10,10 +10,12 @@
 
 import itertools
 
+from attrs import evolve
+from helpers import diver_runs
 import numpy as np
 import pytest
 
-from sonar_imm.measurements import Fix, NOBODY, Start
+from sonar_imm.measurements import NOBODY, Start
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 SECOND = 10**9
@@ -30,13 +32,7 @@ def start(second, x, y=0.0, sigma=1.0):
 
 
 def fix(second, x, y=0.0, name=NOBODY):
-    return Fix(
-        stamp_ns=round(second * SECOND),
-        position=[x, y, 0.0],
-        covariance=np.eye(2) * 0.04,
-        target_id=name,
-        frame_id='map',
-    )
+    return evolve(diver_runs.fix(second, x, y, 0.04 * np.eye(2)), target_id=name)
 
 
 def run(measurements, **options):
@@ -47,13 +43,7 @@ def run(measurements, **options):
 
 @pytest.mark.parametrize(
     'options',
-    [
-        {},
-        {'association': 'jipda'},
-        {'association': 'gnn'},
-        {'dimensions': 3},
-        {'max_tracks': 1},
-    ],
+    [{}, {'association': 'jipda'}, {'association': 'gnn'}, {'dimensions': 3}, {'max_tracks': 1}],
 )
 def test_a_track_begins_confirmed_at_the_place_and_follows_the_fixes_after_it(options):
     tracker, first = run([start(1, 5.0, 7.0, sigma=2.0)], **options)
@@ -122,14 +112,7 @@ def test_a_start_is_no_missed_detection():
 
 
 def test_the_order_of_arrival_changes_nothing():
-    items = [
-        fix(1, 0.0),
-        fix(2, 0.2),
-        start(2, 30.0),
-        start(2.5, 0.5),
-        fix(3, 0.4),
-        fix(3, 30.1),
-    ]
+    items = [fix(1, 0.0), fix(2, 0.2), start(2, 30.0), start(2.5, 0.5), fix(3, 0.4), fix(3, 30.1)]
     _, expected = run(items)
     for order in itertools.islice(itertools.permutations(items), 0, 720, 79):
         tracker = DiverTracker(DiverConfig())

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimation.consistency import average_bounds
-from sonar_imm.measurements import Fix
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.config import ADAPTATIONS, MODEL_SETS
 from sonar_imm.trackers.diver.known import predict_over, track_outputs
@@ -109,53 +108,6 @@ def test_consistency_where_the_models_hold():
     assert low < np.mean(squared) < high
 
 
-def test_a_late_fix_revises_everything_after_it():
-    tracker = DiverTracker(DiverConfig(max_tracks=1))
-    for second in (1, 2, 4, 5):
-        tracker.process(fix(second, second, 0.0))
-    revised = tracker.process(fix(3, 3.0, 0.0))
-    assert [estimate.stamp_ns // SECOND for estimate in revised] == [3, 4, 5]
-    assert tracker.counts == {'used': 5, 'late': 1, 'doubted': 0}
-
-
-def test_bad_timing_is_counted_and_harmless():
-    tracker = DiverTracker(DiverConfig(history=2.0, max_tracks=1))
-    for second in range(1, 20):
-        tracker.process(fix(second, second, 0.0))
-    assert tracker.process(fix(5, 5.0, 0.0)) == []
-    assert tracker.counts['too_late'] == 1
-    assert tracker.process(fix(19, 19.0, 0.0)) == []
-    assert tracker.counts['duplicate'] == 1
-    assert tracker.process(fix(10**6, 0.0, 0.0)) == []  # an outlying stamp far ahead
-    assert len(tracker.process(fix(20, 20.0, 0.0))) == 1
-    assert tracker.counts['doubted'] == 1
-
-
-def test_a_restarted_clock_is_noticed_and_loses_nothing():
-    tracker = DiverTracker(DiverConfig(restart_after=4, max_tracks=1))
-    first = run(tracker, [fix(second, second, 0.0) for second in range(1000, 1020)])
-    again = run(tracker, [fix(second, second, 0.0) for second in range(10, 30)])
-    assert tracker.counts['restarts'] == 1 and tracker.counts['too_late'] == 0
-    assert [estimate.stamp_ns // SECOND for estimate in again] == list(range(10, 30))
-    assert first[-1].extras['track_id'][0] != again[-1].extras['track_id'][0]
-
-
-def test_a_burst_of_late_fixes_ends_no_track():
-    tracker = DiverTracker(DiverConfig(max_tracks=1))
-    before = run(tracker, [fix(second, second, 0.0) for second in range(100, 160)])
-    assert run(tracker, [fix(second + 0.5, second, 0.0) for second in range(125, 130)]) == []
-    after = run(tracker, [fix(second, second, 0.0) for second in range(160, 170)])
-    assert tracker.counts['restarts'] == 0 and tracker.counts['too_late'] == 5
-    assert after[-1].extras['track_id'].tolist() == before[-1].extras['track_id'].tolist()
-
-
-def test_another_frame_is_refused_by_name():
-    tracker = DiverTracker(DiverConfig())
-    tracker.process(fix(1, 0.0, 0.0))
-    assert tracker.process(fix(2, 0.0, 0.0, frame_id='odom')) == []
-    assert tracker.counts['other_frame'] == 1
-
-
 def test_an_outlier_is_not_believed():
     tracker = DiverTracker(DiverConfig(max_tracks=1))
     clean = DiverTracker(DiverConfig(max_tracks=1))
@@ -166,42 +118,6 @@ def test_an_outlier_is_not_believed():
             clean.process(fix(second, 0.5 * second, 0.0))
     assert abs(last.state[0, 0] - 14.5) < 0.5
     assert last.extras['track_id'][0] == 1
-
-
-def test_a_turned_and_shifted_scene_gives_the_turned_and_shifted_answer():
-    turn = 2.0 * np.pi * 3 / 16
-    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    shift = np.array([1000.0, -500.0])
-    scene = simulate(scenario('zigzag', {'duration': 30.0}), seed=5)
-    plain, turned = DiverTracker(DiverConfig()), DiverTracker(DiverConfig())
-    for item in scene.measurements:
-        z, C = item.measurement.position[:2], item.measurement.covariance[:2, :2]
-        a = plain.process(item.measurement)[-1]
-        b = turned.process(
-            Fix(
-                stamp_ns=item.measurement.stamp_ns,
-                frame_id='map',
-                position=np.append(R @ z + shift, 0.0),
-                covariance=R @ C @ R.T,
-            )
-        )[-1]
-    np.testing.assert_allclose(b.state[0, :2], R @ a.state[0, :2] + shift, atol=1e-6)
-    np.testing.assert_allclose(
-        b.covariance[0, :2, :2], R @ a.covariance[0, :2, :2] @ R.T, atol=1e-6
-    )
-    np.testing.assert_allclose(b.probabilities[0, 3:16], a.probabilities[0, :13], atol=1e-6)
-
-
-def test_several_divers_keep_their_names():
-    scene = simulate(scenario('several', {'spacing': 25.0}), seed=2)
-    tracker = DiverTracker(DiverConfig(clutter_density=2.0 / 200.0**2))
-    estimates = run(tracker, [item.measurement for item in scene.measurements])
-    confirmed = [
-        estimate.extras['track_id'][estimate.extras['track_state'] > 0]
-        for estimate in estimates[10:]
-    ]
-    assert np.mean([len(ids) for ids in confirmed]) == pytest.approx(4.0, abs=0.35)
-    assert len(set(np.concatenate(confirmed).tolist())) <= 7
 
 
 def test_a_scan_that_misses_a_diver_teaches_nothing_of_its_turns():

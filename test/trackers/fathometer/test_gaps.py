@@ -40,13 +40,6 @@ def test_after_a_gap_it_is_as_if_there_had_been_none(gap):
     assert found['error, 1st, m'] <= 1.5 * bound['error, 1st, m']
 
 
-def test_a_gap_that_is_taken_for_a_record_loses_layers():
-    traces, truth = scene(30, 0.1, 0)
-    once = {'record_interval': 86400.0, 'slope_std': 0.0}
-    right = tracked(traces, truth, **once, **OPTIONS)['right']
-    assert right[BEFORE - 5 : BEFORE].all() and not right[BEFORE : BEFORE + 2].any()
-
-
 @pytest.mark.parametrize('seed', range(3))
 def test_the_first_record_has_no_reflector_too_many(seed):
     """Were every number equally probable before, most first records would have one."""
@@ -74,14 +67,7 @@ def test_after_too_long_a_gap_all_is_new():
     tracker, found = run(traces[:10], max_gap=1e8, **OPTIONS)
     before = max(found.values(), key=lambda each: each.stamp_ns).extras['track_id']
     late = traces[10].stamp_ns + (LONGEST_GAP + 1) * 10 * 10**9
-    (estimate,) = tracker.process(
-        type(traces[10])(
-            stamp_ns=late,
-            depth=traces[10].depth,
-            amplitude=traces[10].amplitude,
-            sigma=traces[10].sigma,
-        )
-    )
+    (estimate,) = tracker.process(evolve(traces[10], stamp_ns=late))
     assert not set(estimate.extras['track_id']) & set(before)
     assert len(before) == len(LAYERS) and tracker.counts['gaps'] == 1
 

@@ -20,6 +20,18 @@ from sonar_imm.trackers.fathometer.response import lattice_of_trace
 from sonar_imm.trackers.fathometer.tracker import FathometerTracker
 
 
+def scene_with(scene, heave, seed):
+    """Traces whose errors are new in each record or last, and the errors."""
+    if heave == 'memory':
+        return lasting(scene, seed)
+    return list(scene.traces(range(40))), scene.file['array_depth_error'][:40]
+
+
+def heaves_of(estimates):
+    """Heave and its standard deviation (T, 2)."""
+    return np.array([[each.extras[k][0] for k in ('heave', 'heave_std')] for each in estimates])
+
+
 @pytest.fixture(scope='module')
 def scene():
     return sea_scene('heave')
@@ -67,17 +79,6 @@ def test_layers_are_followed_although_the_array_heaves(scene):
     assert last.extras['two_way_time'] == pytest.approx(expected, abs=1e-12)
 
 
-def test_without_the_state_they_are_lost(scene):
-    """Unless all of them may jump together: then their depths are as wrong as the array's."""
-    still = {'particles': 2000, 'slope_std': 0.0, 'heave': 'none'}
-    _, jumping = run(scene.traces(range(40)), **still)
-    assert score_scene(jumping, scene, after=20).right > 0.9
-    _, found = run(scene.traces(range(40)), **still, common_jump_probability=0.0)
-    assert score_scene(found, scene, after=20).right < 0.5
-    assert all((each.extras['heave'] == 0.0).all() for each in found.values())
-    assert all((each.extras['heave_std'] == 0.0).all() for each in found.values())
-
-
 def lasting(scene, seed, records=40):
     """The same layers, the errors of an autoregression in place of the independent ones; and these
     errors."""
@@ -122,18 +123,13 @@ def test_the_heave_is_known_as_a_kalman_filter_knows_it(scene, heave, seed, dept
     """Where the layers lie in the records is plain to see. What that says of heave and depths,
     which no record tells apart, is then a matter of two Gaussian numbers. A filter whose particles
     all descend from the one that explains the first record best is sure of that one's heave."""
-    traces, wrong = lasting(scene, seed)
-    if heave == 'independent':
-        traces = list(scene.traces(range(40)))
-        wrong = scene.file['array_depth_error'][:40]
+    traces, wrong = scene_with(scene, heave, seed)
     options = {'heave': heave, 'array_depth_std': 0.5, 'depth_std': depth_std, **WINDOW}
     _, found = run(traces, particles=3000, seed=seed, **options)
-    layers = len(scene.amplitude)
     seen = [scene.depth_at(each.stamp_ns).mean() + w for each, w in zip(traces, wrong)]
-    expected = kalman(seen, layers, depth_std, 0.5, 0.9 if heave == 'memory' else 0.0)
-    heaves = np.array(
-        [[each.extras[k][0] for k in ('heave', 'heave_std')] for each in found.values()]
-    )
+    memory = 0.9 if heave == 'memory' else 0.0
+    expected = kalman(seen, len(scene.amplitude), depth_std, 0.5, memory)
+    heaves = heaves_of(found.values())
     assert heaves[:, 1] == pytest.approx(expected[:, 1], rel=0.08)
     away = (heaves[:, 0] - expected[:, 0]) / expected[:, 1]
     assert rms(away) < 0.1 and np.abs(away).max() < 0.2
@@ -158,22 +154,15 @@ def known_later(seen, layers, depth_std, std, memory, lag):
 def test_the_heave_of_revised_records_is_known_as_what_came_later_tells(scene, heave, lag):
     """The offset that depths and shifts share, as the newest record knows it, not as the revised
     one did, which would state twice the error at first."""
-    traces, wrong = lasting(scene, 1)
-    if heave == 'independent':
-        traces = list(scene.traces(range(40)))
-        wrong = scene.file['array_depth_error'][:40]
+    traces, wrong = scene_with(scene, heave, 1)
     options = {'heave': heave, 'array_depth_std': 0.5, 'smoothing_lag': lag, **WINDOW}
     _, found = run(traces, particles=3000, seed=1, **options)
-    memory = 0.9 if heave == 'memory' else 0.0
     seen = [scene.depth_at(each.stamp_ns).mean() + w for each, w in zip(traces, wrong)]
-    layers = len(scene.amplitude)
-    expected = known_later(seen, layers, 0.1, 0.5, memory, lag)
+    known = seen, len(scene.amplitude), 0.1, 0.5, 0.9 if heave == 'memory' else 0.0
+    expected = known_later(*known, lag)
     # Without a lag it is the filter of above.
-    assert known_later(seen, layers, 0.1, 0.5, memory, 0) == pytest.approx(
-        kalman(seen, layers, 0.1, 0.5, memory), abs=2e-3
-    )
-    revised = list(found.values())[: len(expected)]
-    heaves = np.array([[each.extras[k][0] for k in ('heave', 'heave_std')] for each in revised])
+    assert known_later(*known, 0) == pytest.approx(kalman(*known), abs=2e-3)
+    heaves = heaves_of(list(found.values())[: len(expected)])
     assert heaves[:, 1] == pytest.approx(expected[:, 1], rel=0.08)
     away = (heaves[:, 0] - expected[:, 0]) / expected[:, 1]
     assert rms(away) < 0.1 and np.abs(away).max() < 0.25
@@ -185,21 +174,6 @@ def test_an_error_that_lasts_is_followed_with_a_memory(scene):
     assert score_scene(found, scene, after=15).right >= 0.95
     _, relative, _, _ = errors(found, scene, after=15)
     assert rms(relative) <= 0.03
-
-
-def test_threads_do_not_change_a_byte(scene):
-    def columns(**parameters):
-        _, found = run(
-            scene.traces(range(6)),
-            particles=1001,
-            heave='memory',
-            array_depth_std=0.5,
-            polarity='both',
-            **parameters,
-        )
-        return [c.tobytes() for each in found.values() for c in each.columns().values()]
-
-    assert columns() == columns(threads=4)
 
 
 def test_what_heave_needs():

@@ -51,13 +51,6 @@ def test_after_a_fault_all_have_their_ids(jump):
     assert found[RECORDS * 10**9].extras['dipping'].max() < 0.2
 
 
-def test_without_jumps_they_are_lost():
-    floor = 3.0 * (np.arange(RECORDS) >= AT)
-    tracker, _, ids, found = tracked(floor, common_jump_probability=0.0)
-    assert max(ids) > 1 and tracker.warnings() == []
-    assert all(each.extras['common_jump'][0] == 0.0 for each in found.values())
-
-
 def test_over_steep_waves_all_keep_their_ids():
     floor = 4.0 * np.sin(2.0 * np.pi * np.arange(30) / 25.0)
     tracker, right, ids, _ = tracked(floor)

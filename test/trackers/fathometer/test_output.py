@@ -49,14 +49,6 @@ def test_echoes_are_positive_and_where_they_should_be(spectra, output):
     assert depth[np.argmax(e)] == pytest.approx(LAYER, abs=0.2)
 
 
-def test_red_noise_spoils_a_correlation(spectra):
-    def strength(output):
-        _, b, sigma = received(spectra, 110.0, 140.0, output=output)
-        return b.max() / sigma
-
-    assert strength('coherence') > 1.5 * strength('correlation')
-
-
 def test_equation_4_as_printed_has_its_echo_above_the_array(spectra):
     w = steering(spectra.frequency, 0.36 * np.arange(8), 1500.0)
     C = printed_correlation(spectra.csdm, w, 'mvdr', loading=1e-3)

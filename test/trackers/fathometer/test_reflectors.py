@@ -76,16 +76,10 @@ def layers(depths, amplitudes, records=4, reference_depth=25.0):
     pulse = band_pulse(50.0, 4000.0, 1500.0)
     clean = sum(a * pulse(depth - z) for z, a in zip(depths, amplitudes))
     rng = np.random.default_rng(1)
+    known = {'depth': depth, 'sigma': np.ones(len(depth)), 'reference_depth': reference_depth}
     for k in range(1, records + 1):
         amplitude = clean + 0.3 * rng.standard_normal(len(depth))
-        sigma = np.ones(len(depth))
-        yield Trace(
-            stamp_ns=k * 10**9,
-            depth=depth,
-            amplitude=amplitude,
-            sigma=sigma,
-            reference_depth=reference_depth,
-        )
+        yield Trace(stamp_ns=k * 10**9, amplitude=amplitude, **known)
 
 
 def test_times_and_the_bottom_in_the_estimate():
@@ -244,29 +238,15 @@ def test_strength_is_a_mean_of_the_last_twenty_records():
 
 def test_weak_layers_are_not_counted_among_the_detectable():
     rng, depth = np.random.default_rng(5), 0.1 * np.arange(400)
-    traces = []
-    for k in range(40):
-        echo = sum(
-            a * np.exp(-0.5 * np.square((depth - z) / 0.3))
-            for a, z in ((12.0, 10.0), (8.0, 18.0), (2.4, 27.0))
-        )
-        noise = np.convolve(
-            rng.standard_normal(430),
-            np.exp(-0.5 * np.square(np.arange(-15, 16) / 3.0 * 1.41)),
-            'same',
-        )[15:415]
-        noise /= noise.std()
-        traces.append(
-            Trace(
-                stamp_ns=(k + 1) * 10**9, depth=depth, amplitude=echo + noise, sigma=np.ones(400)
-            )
-        )
-    tracker = FathometerTracker(
-        FathometerConfig(pulse='gaussian', pulse_width=0.3, particles=1000)
-    )
-    rows = [tracker.process(trace)[0].columns() for trace in traces]
-    late = rows[10:]
-    said = np.mean([row['prob_detectable_2'][0] for row in late])
-    assert said > 0.95
+    echo = np.exp(-0.5 * np.square((depth[:, None] - [10.0, 18.0, 27.0]) / 0.3)) @ [12.0, 8.0, 2.4]
+    pulse = np.exp(-0.5 * np.square(np.arange(-15, 16) / 3.0 * 1.41))
+    config = FathometerConfig(pulse='gaussian', pulse_width=0.3, particles=1000)
+    tracker, late = FathometerTracker(config), []
+    for k in range(1, 41):
+        noise = np.convolve(rng.standard_normal(430), pulse, 'same')[15:415]
+        seen = {'depth': depth, 'amplitude': echo + noise / noise.std(), 'sigma': np.ones(400)}
+        (estimate,) = tracker.process(Trace(stamp_ns=k * 10**9, **seen))
+        late += [estimate.columns()] if k > 10 else []
+    assert np.mean([row['prob_detectable_2'][0] for row in late]) > 0.95
     assert late[0]['detectable_amplitude'][0] == pytest.approx(4.0)
     assert sum(late[-1][f'prob_detectable_{k}'][0] for k in range(13)) == pytest.approx(1.0)

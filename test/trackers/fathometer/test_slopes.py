@@ -45,14 +45,6 @@ def test_layers_that_dip_are_followed_without_a_parameter(kind, dip, gap):
     assert found['dipping'] > 0.9
 
 
-def test_without_slopes_they_are_lost():
-    traces, truth = case('parallel', 0.4, 0, 0)
-    found = summary(
-        [tracked(traces, truth, slope_std=0.0, common_jump_probability=0.0, **OPTIONS)]
-    )
-    assert found['P, before'] < 0.5 and found['identities'] > 2 * len(LAYERS)
-
-
 def test_layers_that_are_still_are_called_so():
     traces, truth = case('parallel', 0.0, 0, 0)
     tracker, found = run(traces, **OPTIONS)

@@ -19,6 +19,19 @@ from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.tracker import FathometerTracker
 from sonar_imm.trackers.fathometer.water import SeenFloor, Water
 
+
+def test_an_echo_at_a_fixed_depth_and_a_line_that_begins_below_its_floor_are_said():
+    for fixed, said in (({'fixed': 0.2}, True), ({}, False)):
+        traces, _ = line(4, records=75, waves=1.0, **fixed)
+        warnings = run(traces, particles=50)[0].warnings()
+        assert any('it may belong to the instrument' in each for each in warnings) == said
+        assert said or warnings == []
+    traces, _ = line(5, records=30, scatter=0.5)
+    cut = [evolve(each, depth=each.depth[210:], amplitude=each.amplitude[210:]) for each in traces]
+    warnings = run(cut, particles=50)[0].warnings()
+    assert any('no water is seen' in each or 'none of' in each for each in warnings)
+
+
 FEW = {'particles': 300, 'min_separation': 0.45, 'depth_std': 0.35, 'order_max': 6}
 
 
@@ -108,25 +121,6 @@ def test_the_transmit_pulse_is_left_out_and_said():
     assert tracker.warnings() == [] and rows[-1]['blanked'][0] == 0.0
 
 
-def test_an_echo_at_a_fixed_depth_is_doubted():
-    traces, _ = line(4, records=75, fixed=0.2, waves=1.0)
-    tracker, _ = run(traces, particles=50)
-    assert any('it may belong to the instrument' in each for each in tracker.warnings())
-    traces, _ = line(4, records=75, waves=1.0)
-    tracker, _ = run(traces, particles=50)
-    assert tracker.warnings() == []
-
-
-def test_a_line_that_begins_below_its_floor_is_said():
-    traces, floor = line(5, records=30, scatter=0.5)
-    cut = [
-        Trace(stamp_ns=each.stamp_ns, depth=each.depth[210:], amplitude=each.amplitude[210:])
-        for each in traces
-    ]
-    tracker, _ = run(cut, particles=50)
-    assert any('no water is seen' in each or 'none of' in each for each in tracker.warnings())
-
-
 def test_arrays_and_signed_traces_are_as_before():
     rng, depth = np.random.default_rng(6), 0.05 * np.arange(300)
     for options, sign in (({}, -1.0), ({'water': 'off'}, 1.0)):
@@ -140,16 +134,12 @@ def test_arrays_and_signed_traces_are_as_before():
 
 
 def test_missing_samples_and_other_depths_are_taken():
-    traces, _ = line(8, records=30)
-    rng = np.random.default_rng(0)
-    odd = []
-    for k, each in enumerate(traces):
+    rng, odd = np.random.default_rng(0), []
+    for k, each in enumerate(line(8, records=30)[0]):
         amplitude = each.amplitude.copy()
         amplitude[rng.integers(0, len(amplitude), 20)] = np.nan
         first = k % 3
-        odd.append(
-            Trace(stamp_ns=each.stamp_ns, depth=each.depth[first:], amplitude=amplitude[first:])
-        )
+        odd.append(evolve(each, depth=each.depth[first:], amplitude=amplitude[first:]))
     tracker, rows = run(odd)
     assert tracker.counts['used'] == 30
     assert np.mean([each['is_bottom'].max() > 0.9 for each in rows[9:]]) > 0.9

@@ -285,6 +285,9 @@ def test_the_scale_of_stated_variances_is_found():
         'times more than stated: allowed for'
     )
     assert 'bearings scatter' in bearings and 'less than stated' in bearings
+    _, narrow = wide.warnings(CONFIG, True)
+    _, broad = learned(white * 3.0).warnings(CONFIG, True)
+    assert narrow == bearings and 'check the stamps of nav' in broad
     as_stated = evolve(CONFIG, variance_scale_min=1.0, variance_scale_max=1.0)
     assert learned(white * 3.0, as_stated).factor(as_stated).tolist() == [1.0, 1.0]
 

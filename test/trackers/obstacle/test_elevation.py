@@ -89,23 +89,6 @@ def test_the_height_is_known_as_well_as_the_cramer_rao_bound_allows():
     assert 0.6 < np.mean(nees) < 1.5
 
 
-def test_no_sixteen_metres_of_ambiguity():
-    """In calm water, 30 m ahead: a fifth of the metres that a flat sonar leaves, on the right
-    side, among all behaviours."""
-    half = []
-    for std in (0.0, 1.0):
-        overrides = {'elevation_std_deg': std, 'vertical_offset': -3.0, 'offset_spread': 0.0}
-        scene, final = track_scene('calm', 4, overrides)
-        truth = scene.truth[0]
-        k = int(np.flatnonzero(truth.range < 30.0)[0])
-        estimate = final[int(truth.stamp_ns[k])]
-        low, high = (estimate.extras[f'vertical_offset_{end}'][0] for end in ('lo', 'hi'))
-        half.append(0.5 * (high - low))
-    assert low < truth.vertical_offset[k] < high
-    assert half[1] < 0.2 * half[0] and half[1] < 0.5
-    assert estimate.probabilities[0, 0] > 0.999
-
-
 def some_mixture(T=3, K=4, seed=0):
     rng = np.random.default_rng(seed)
     x = np.zeros((T, K, 6))

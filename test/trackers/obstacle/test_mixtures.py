@@ -19,8 +19,6 @@ from sonar_imm.trackers.obstacle import unscented as behave
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import BehaviourSlices, Sonar
 
-MODELS = {'plane': False, 'cone': True}
-PRIVATE = np.array([0, 1, 2, 8, 9])
 """The states of the obstacle itself."""
 
 
@@ -129,69 +127,6 @@ def test_mixing_leaves_depth_slices_alone_and_drops_the_improbable():
     assert np.all(mu1[:, 4:8] == 0.0)
     assert_allclose(mu1[:, :4].sum(axis=1) / mu1[:, 8], mu[:, :4].sum(axis=1) / mu[:, 8])
     assert np.all(x1[:, 8] == x[:, 8]) and np.all(P1[:, 8] == P[:, 8])
-
-
-def numpy_advance(x, P, motion, j, before, after, noise, model):
-    own = PRIVATE if motion.prior[j] else PRIVATE[:3]
-    n = len(own)
-    centre, C = x[own], P[np.ix_(own, own)]
-    columns = (np.sqrt(n + 1.0) * np.linalg.cholesky(C)).T
-    points = np.concatenate([centre[None], centre + columns, centre - columns])
-    weights = np.array([1.0 / (n + 1.0)] + [0.5 / (n + 1.0)] * (2 * n))
-    d, delta, z = points[:, :3].T
-    s = np.full(len(d), x[3])
-    m = geometry.reconstruct(d, delta, z - before.position[2], before.R, model)
-    stretch = np.stack([1.0 + s, 1.0 + s, np.ones_like(s)], axis=-1)
-    moved = geometry.apply(before.R, m) + (before.position - after.position) * stretch
-    if n == 5:
-        moved[:, :2] += motion.step[j] * points[:, 3:]
-    seen = geometry.apply(after.R.T, moved)
-    images = np.column_stack([*geometry.project(seen, model), z, motion.keep[j] * points[:, 3:]])
-    mean = weights @ images
-    off = images - mean
-    covariance = np.einsum('s,si,sj->ij', weights, off, off)
-    covariance[0, 0] += noise[0]
-    covariance[1, 1] += noise[0] / mean[0] ** 2 + noise[1]
-    covariance[2, 2] += noise[2]
-    if n == 5:
-        J = np.zeros((2, 2))
-        for i in range(2):
-            step = np.zeros(3)
-            step[i] = 1e-5
-            ahead, back = (
-                np.array(
-                    geometry.project(geometry.apply(after.R.T, moved[0] + sign * step), model)
-                )
-                for sign in (1.0, -1.0)
-            )
-            J[:, i] = (ahead - back) / 2e-5
-        G = np.zeros((5, 2))
-        G[:2], G[3:] = motion.push[j] * J, np.eye(2)
-        square = x[own[3:]] @ x[own[3:]] + np.trace(C[3:, 3:])
-        share = np.clip(square / motion.slow[j], 0.01, 1.0) if motion.slow[j] else 1.0
-        covariance += share * motion.noise[j] * G @ G.T
-    return mean, covariance
-
-
-@pytest.mark.parametrize('model', MODELS)
-def test_prediction_equals_numpy(model):
-    rng = np.random.default_rng(3)
-    before, after = poses(rng)
-    x, P, mu = targets(rng, before)
-    noise, how = np.array([1e-3, 2e-7, 3e-4]), motion()
-    step = behave.Step(*before, *after, noise, MODELS[model])
-    x1, P1, repaired = behave.advance(x, P, mu, how, step)
-    assert not repaired.any()
-    for t in range(2):
-        for j in range(9):
-            mean, covariance = numpy_advance(x[t, j], P[t, j], how, j, before, after, noise, model)
-            own = PRIVATE[: len(mean)]
-            others = np.setdiff1d(np.arange(10), [*own, 3])
-            assert_allclose(x1[t, j, own], mean, rtol=1e-11, atol=1e-12)
-            found = P1[t, j][np.ix_(own, own)]
-            assert_allclose(found, covariance, rtol=1e-6, atol=1e-10)
-            assert x1[t, j, 3] == x[t, j, 3]
-            assert np.all(x1[t, j, others] == 0.0) and np.all(P1[t, j, others] == 0.0)
 
 
 def test_fixed_components_are_predicted_as_the_fixed_filter_does():

@@ -28,6 +28,7 @@ from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 from sonar_imm.trackers.obstacle.unscented import Motion, NAV, Step
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
+CONFIG = ObstacleConfig()
 VECTORS = Path(__file__).resolve().parents[2] / 'vectors/obstacle_in_clutter'
 ORDER = [0, 1, 2, 5, 6, 7, 8, 9, 3, 4]
 """Of our states in those of the vectors, (d, delta, z, e_N, e_E, s, psi, b_N, b_E, tau)."""
@@ -319,26 +320,49 @@ def test_poses_that_are_late_are_said(late, word):
     assert sentence.startswith('poses arrive 0.') and f's {word}: allowed for' in sentence
 
 
+@pytest.mark.parametrize('name, seed', [('1.5 s late', 3000), ('1.5 s late', 3003)])
+def test_poses_far_too_late_are_not_said_to_be_allowed_for(name, seed):
+    """Whether the offset is wrong, as in the first encounter, or not: nothing tells."""
+    given, _ = encounter(name, seed)
+    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=LEVER['sonar_lever']))
+    run(tracker, given)
+    first, *others = tracker.warnings()
+    assert not any('allowed for' in each for each in others)
+    assert first.startswith('bearings scatter') and first.endswith(
+        'as if poses came later than navigation_delay_std holds, so heights and behaviours may be '
+        'wrong by more than stated; check the stamps of nav'
+    )
+
+
 def test_an_error_is_said_where_it_is_sure_and_matters():
     """Along the course and across it, east and north, with their signs."""
     small = np.diag([1e-3, 1e-3, 3e-3, 3e-3, 0.01]) ** 2
     north = np.array([1.0, 0.0, 0.0])
     drifts = NavigationErrors(np.array([0.0, 0.0, -0.05, 0.0, 0.0]), small)
-    assert drifts.warnings(north, 3) == [
+    assert drifts.warnings(north, 3, CONFIG) == [
         'navigation drifts by 0.05 m/s against what 3 obstacles show (0.00 m/s east, 0.05 m/s '
         'north): allowed for; check the log or the current'
     ]
-    (alone,) = drifts.warnings(north, 1)
+    config = evolve(CONFIG, drift_std=0.016)
+    (beyond,) = drifts.warnings(north, 3, config)
+    assert beyond.endswith(
+        'north): drift_std does not hold it, so heights and behaviours may be wrong by more than '
+        'stated; check the log or the current'
+    )
+    (alone,) = drifts.warnings(north, 1, CONFIG)
     assert 'against what 1 obstacle shows (' in alone and alone.endswith(', or whether it moves')
     unsure = drifts._replace(covariance=100.0 * small)
-    assert unsure.warnings(north, 3) == []
-    assert drifts._replace(mean=0.5 * drifts.mean).warnings(north, 3) == []
+    assert unsure.warnings(north, 3, CONFIG) == []
+    assert drifts._replace(mean=0.5 * drifts.mean).warnings(north, 3, CONFIG) == []
     aside = NavigationErrors(np.array([0.0, 0.02, 0.0, 0.01, 0.0]), small)
-    assert aside.warnings(north, 1) == [
+    assert aside.warnings(north, 1, CONFIG) == [
         'the sonar seems to be turned by 1.7 deg to port against sonar_mount_rpy_deg, or '
         'navigation drifts sideways by 0.03 m/s'
     ]
     # Drift to port that hides a turn is neither.
-    assert aside._replace(mean=np.array([0.0, 0.02, 0.0, -0.02, 0.0])).warnings(north, 1) == []
+    assert (
+        aside._replace(mean=np.array([0.0, 0.02, 0.0, -0.02, 0.0])).warnings(north, 1, CONFIG)
+        == []
+    )
     still = np.zeros(3)
-    assert aside.warnings(still, 1) == aside.warnings(np.full(3, np.nan), 1) == []
+    assert aside.warnings(still, 1, CONFIG) == aside.warnings(np.full(3, np.nan), 1, CONFIG) == []

@@ -13,7 +13,6 @@ import sys
 
 from helpers.obstacle_runs import (
     approach,
-    AS_STATED,
     EXACT,
     FIXED,
     followed,
@@ -32,12 +31,10 @@ from numpy.testing import assert_allclose
 import pytest
 from scipy.stats import norm
 
-from benchmarks.obstacle_paper import SeafloorTracker
 from benchmarks.real_navigation import data_folder, dead_reckoned, summary
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.obstacle.filters import DepthSlices, Sonar
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
@@ -65,14 +62,6 @@ def test_the_columns_of_an_estimate():
     assert np.all((low < estimate.state[:, 2]) & (estimate.state[:, 2] < high))
 
 
-def test_the_system_is_known_by_name():
-    system = SYSTEMS['obstacle']
-    tracker = system.build(system.config_type()())
-    tracker.warm()
-    assert tracker.health()['tracks'] == 0
-    assert not tracker.counts
-
-
 def test_an_empty_ping_is_a_ping():
     tracker = ObstacleTracker(ObstacleConfig())
     first = rows(NAME)[0]
@@ -82,19 +71,6 @@ def test_an_empty_ping_is_a_ping():
     assert list(estimate.columns())[:6] == [
         'x', 'y', 'z', 'range', 'bearing', 'vertical_offset',
     ]  # fmt: skip
-
-
-def test_what_is_believed_on_the_sea_floor_comes_too_fast():
-    """The paper's observation: measured ranges run ahead of the prediction."""
-    scene, free = track_scene('approach', 3, **AS_STATED)
-    error, variance, _, _ = offset_at(scene, free, 40.0)
-    assert abs(error) < 4.0 * np.sqrt(variance) + 1.0
-    config = ObstacleConfig(sonar_lever=scenario('approach').sonar_lever, **AS_STATED)
-    given = [item.measurement for item in scene.measurements]
-    on_seabed = run(SeafloorTracker(config), given)
-    error, *_ = offset_at(scene, on_seabed, 40.0)
-    assert error == pytest.approx(12.0, abs=1.0)  # it believes the sea floor, 15 m below
-    assert mean_nis(on_seabed) > 1.1 * mean_nis(free)  # what fits worse begins anew
 
 
 @pytest.mark.parametrize('model', ['plane', 'cone'])
@@ -113,17 +89,6 @@ def test_conventions_of_sonars(model, timing):
     assert abs(error) < 3.0 * np.sqrt(variance)
     assert variance < 1.0
     assert mean_nis(final) < 2.6
-
-
-def test_two_way_timing_matters():
-    sharp = {'bearing_std_deg': 0.05}
-    overrides = {'ping_timing': 'two_way', 'yaw_rms_deg': 4.0, 'bearing_step_deg': 0.0, **sharp}
-    _, right = track_scene('approach', 1, overrides, **sharp, **FIXED, **AS_STATED)
-    _, wrong = track_scene(
-        'approach', 1, overrides, ping_timing='instant', **sharp, **FIXED, **AS_STATED
-    )
-    assert mean_nis(right) < 2.4
-    assert mean_nis(wrong) > 3.0
 
 
 # -- how good it says it is --------------------------------------------------------------------
@@ -181,16 +146,6 @@ def test_relief_of_the_sea_floor_does_not_disturb():
         return [offset_at(*run, 30.0)[0] for run in runs]
 
     assert errors(0.5) == pytest.approx(errors(0.0), abs=0.1)
-
-
-def test_navigation_that_is_late_shows_in_the_innovations():
-    def nis(delay):
-        overrides = {'navigation_delay': delay}
-        runs = [track_scene('approach', k, overrides, **FIXED, **AS_STATED)[1] for k in range(4)]
-        return np.mean([mean_nis(final) for final in runs])
-
-    assert nis(0.0) < 2.2
-    assert nis(0.5) > 3.0
 
 
 @pytest.mark.statistics

@@ -8,7 +8,6 @@
 
 """The obstacle tracker on approaches computed elsewhere, with the exact posterior beside them."""
 
-from attrs import evolve
 from helpers.obstacle_runs import (
     approach,
     EXACT,
@@ -126,58 +125,6 @@ def test_estimates_are_where_the_obstacle_is():
         )
 
 
-def mistaken(measurement, change, side=1.0):
-    """Navigation with its roll, pitch and yaw (NED) changed by a function, bearings by a sign."""
-    if isinstance(measurement, Detections):
-        return evolve(measurement, bearing=side * measurement.bearing)
-    if not isinstance(measurement, Navigation):
-        return measurement
-    R = geometry.flip_rotation(geometry.rotation_of_quaternion(measurement.orientation))
-    wrong = geometry.rotation(*change(*geometry.euler_angles(R)))
-    return Navigation(
-        stamp_ns=measurement.stamp_ns,
-        position=measurement.position,
-        orientation=Rotation.from_matrix(geometry.flip_rotation(wrong)).as_quat(),
-        frame_id='odom',
-    )
-
-
-def test_a_wrong_roll_sign_turns_the_answer_over_and_nis_does_not_see_it():
-    """Why the exact posterior is a test, and NIS alone is none."""
-    name = 'approach_dst+3_noisy'
-    config = ObstacleConfig(sonar_lever=lever(name), **FAITHFUL)
-    wrong = [mistaken(item, lambda r, p, y: (-r, p, y)) for item in approach(name)]
-    final = list(run(ObstacleTracker(config), wrong).values())
-    assert final[60].state[0, 2] < -1.5
-    nis = np.nanmean([estimate.extras['nis'][0] for estimate in final[1:]])
-    assert nis < 2.5
-
-
-MISTAKES = {
-    'yaw of ENU': (1.0, lambda r, p, y: (r, p, 0.5 * np.pi - y)),
-    'yaw sign': (1.0, lambda r, p, y: (r, p, -y)),
-    'azimuth sign': (-1.0, lambda r, p, y: (r, p, y)),
-}
-
-
-@pytest.mark.parametrize('mistake', MISTAKES)
-def test_a_wrong_direction_shows_in_the_innovations(mistake):
-    side, change = MISTAKES[mistake]
-    name = 'approach_dst+3_noisy'
-    config = ObstacleConfig(sonar_lever=lever(name), **FIXED)
-    wrong = [mistaken(item, change, side) for item in approach(name)]
-    assert follow(wrong, config)[0].mean() > 30.0
-    right = follow(approach(name), config)[0]
-    assert 1.5 < right.mean() < 2.3
-    # In the tracker nothing is followed for long: tracks come and go.
-    tracks, lasting = (
-        {int(i) for estimate in run(ObstacleTracker(config), measurements).values()
-         for i in estimate.extras['track_id']}
-        for measurements in (wrong, approach(name))
-    )  # fmt: skip
-    assert len(tracks) > 5 > len(lasting)
-
-
 def test_outliers_are_taken_for_what_they_are():
     """One echo in eight is off by up to 8 m and 6 degrees."""
     name = 'approach_dst+3_noisy'
@@ -293,12 +240,6 @@ def test_the_true_behaviour_is_found(name, number):
     true = kind.get(str(data['kind']), str(data['kind']))
     last = track(data)[-1]
     assert last.extras[f'prob_{true}'][0] > (0.5 if true == 'seabed' else 0.9)
-
-
-def test_a_mover_is_lost_without_the_behaviour():
-    """Why it is there: under `fixed` alone the same echoes make many tracks."""
-    data = encounter('moving_target')
-    assert len(tracks_of(track(data, behaviours=('fixed',)))) >= 4
 
 
 def test_only_the_behaviours_asked_for_are_published():

@@ -6,9 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Where the filter starts, near nadir, and which floor is called rough."""
+"""Where the filter starts, and near nadir."""
 
-from attrs import evolve
 from helpers.bathymetry_cases import floor
 import numpy as np
 import pytest
@@ -125,35 +124,3 @@ def test_grid_and_particles_agree_on_drifting_angles():
     off = np.abs(many[0].state[:, 0] - exact[0].state[:, 0]) / std
     assert np.mean(off) < 0.05
     assert np.mean(np.abs(many[0].probabilities - exact[0].probabilities)) < 0.01
-
-
-def overlap(name, values, **config):
-    made, truth = run(name, {'pings': 4, **values}, **config)
-    rough = np.concatenate([each.extras['rough'] > 0.5 for each in made])
-    patch = np.concatenate([each.patch for each in truth])
-    return (rough & patch).sum() / (rough | patch).sum()
-
-
-@pytest.mark.statistics
-def test_the_bank_finds_correlated_and_white_roughness():
-    bank = {'model_set': 'height_bank'}
-    assert overlap('paper', {}, **bank) > 0.93
-    assert overlap('correlated', {'correlation_length': 0.3}, **bank) > 0.85
-    assert overlap('correlated', {}, **bank) > 0.66
-    assert overlap('slope', {'slope': 0.05}, **bank) > 0.9
-
-
-def test_which_walks_are_rough_and_what_a_bank_defaults_to():
-    bank = BathymetryConfig(model_set='height_bank')
-    assert (bank.runs_on_grid, bank.smoothing_used, bank.stay_used) == (True, 'states', 0.998)
-    other = BathymetryConfig(model_set='height_two_rw')
-    assert (other.runs_on_grid, other.smoothing_used, other.stay_used) == (False, 'none', 0.995)
-    particles = evolve(bank, engine='particles')
-    assert particles.smoothing_used == 'none'
-    snapshot = floor(0.0, ranges=20.0 + 0.05 * np.arange(40))
-    estimate = BathymetryTracker(bank).process(snapshot)[0]
-    assert estimate.extras['rough'] == pytest.approx(estimate.probabilities[:, 2:].sum(axis=1))
-    later = BathymetryTracker(evolve(bank, rough_sigma=0.5)).process(snapshot)[0]
-    assert later.extras['rough'] == pytest.approx(estimate.probabilities[:, 3])
-    plain = BathymetryTracker(other).process(snapshot)[0]
-    assert 'rough' not in plain.extras

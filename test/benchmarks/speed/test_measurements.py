@@ -1,0 +1,96 @@
+# Copyright 2026 The sonar_imm developers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+
+"""What is measured beside a peer is the same sums, and every variant is measured."""
+
+import pytest
+
+from benchmarks.speed import bathymetry, diver, fathometer, obstacle
+
+
+@pytest.fixture
+def short(monkeypatch):
+    ping = bathymetry.a_ping(last_range=27.0)
+    monkeypatch.setattr(bathymetry, 'a_ping', lambda **values: ping)
+    monkeypatch.setattr(bathymetry, 'PEER_BINS', 60)
+    monkeypatch.setattr(fathometer, 'PARTICLES', 500)
+    return ping
+
+
+def test_both_filters_of_a_floor_are_one_filter(short):
+    result = bathymetry.bench_numpy(rounds=1)
+    assert result['rms_difference_m'] < 0.05
+    assert set(result['bins_per_second']) == {'particles', 'gated', 'grid', 'numpy'}
+
+
+def test_the_best_round_of_each_method_counts(monkeypatch):
+    """By a clock that only the methods move: rounds of 3, 2 and 4 seconds for 10 bins are 5 bins
+    per second; the first call compiles and is not timed."""
+    clock, costs = [0.0], {'a': iter([100.0, 3.0, 2.0, 4.0]), 'b': iter([1.0, 8.0, 9.0, 10.0])}
+
+    def take(name):
+        clock[0] += next(costs[name])
+
+    monkeypatch.setattr(bathymetry.time, 'perf_counter', lambda: clock[0])
+    methods = {'a': (lambda: take('a'), 10), 'b': (lambda: take('b'), 4)}
+    assert bathymetry.rates(methods, rounds=3) == {'a': 5.0, 'b': 0.5}
+
+
+def test_stone_soup_follows_the_same_floor(short):
+    pytest.importorskip('stonesoup')
+    height = bathymetry.stone_soup_filter(bathymetry.cut(short, 60))
+    assert abs(height[20:]).max() < 0.5
+    speeds = bathymetry.bench_stone_soup(rounds=1)['bins_per_second']
+    assert set(speeds) == {'particles', 'stone_soup'}
+
+
+def test_every_variant_of_the_floor_is_measured(short):
+    speed = bathymetry.bench_threads(1, 1)['bins_per_second']
+    speed = {**speed, **bathymetry.bench_scaling(rounds=1)['bins_per_second']}
+    assert len(speed) >= 13 and min(speed.values()) > 0.0
+
+
+def test_filterpy_does_the_same_sums_for_a_diver():
+    pytest.importorskip('filterpy')
+    assert diver.bench_step(rounds=1, steps=8)['largest_difference_m'] < 1e-9
+
+
+def test_divers_are_tracked_in_each_measurement():
+    assert diver.bench_scan(targets=40, scans=3)['assigned'] > 0.9
+    stamps = diver.bench_stamps(rounds=1, fixes=30)
+    clutter = diver.bench_clutter(rounds=1, scans=15)
+    assert min(stamps['regular_cpu_ms'], stamps['irregular_cpu_ms']) > 0.0
+    assert clutter['fixes'] > 15 and min(clutter['gnn_cpu_ms'], clutter['jipda_cpu_ms']) > 0.0
+
+
+def test_the_short_likelihood_is_the_long_one_and_threads_change_no_byte(short):
+    result = fathometer.bench_likelihood(rounds=1, sets=5)
+    assert result['good'] and result['largest_relative_difference'] < 1e-6
+    result = fathometer.bench_threads(threads=2, records=4)
+    assert result['same_bytes'] and set(result['median_ms']) == {'1', '2'}
+
+
+def test_every_step_from_pressure_to_response_is_timed():
+    result = fathometer.bench_array(rounds=1, snapshots=3, length=960, hydrophones=6)
+    assert len(result['ms']) == 6 and min(result['ms'].values()) > 0.0
+    assert 'mvdr' in fathometer.BENCHES[-1].sentence(result)
+
+
+def test_a_record_is_timed_with_all_its_reflectors(monkeypatch):
+    monkeypatch.setattr(fathometer, 'PARTICLES', 20_000)
+    record = fathometer.bench_record(2)
+    assert set(record['reflectors'].values()) == {8}
+    assert set(record['median_ms']) == set(record['reflectors'])
+
+
+@pytest.mark.parametrize('name', obstacle.VARIANTS)
+def test_each_variant_tracks_all_obstacles_and_every_ping_is_timed(name):
+    clutter, parameters = obstacle.VARIANTS[name]
+    result = obstacle.bench_ping(rounds=1, pings=16, obstacles=10, clutter=clutter, **parameters)
+    assert result['tracked'] >= 10 and result['pings'] == 6
+    assert 0.0 < result['median_ms'] <= result['p99_ms']

@@ -1,0 +1,21 @@
+# Copyright 2026 The sonar_imm developers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+
+"""Why a message is refused."""
+
+import pytest
+
+from sonar_imm.measurements import Rejection
+
+
+def reason(read, *message, **options):
+    """The code of the refusal, which has to have a sentence of one line."""
+    with pytest.raises(Rejection) as caught:
+        read(*message, **options)
+    assert caught.value.sentence and '\n' not in caught.value.sentence
+    return caught.value.reason
