@@ -133,7 +133,8 @@ class FathometerConfig(StampParameters):
         'shape that one reflector leaves in the response: band (of a flat band), processor (what '
         'mvdr makes of each record of an array; for other records as band), envelope (of the '
         'envelope of a band), gaussian or file; auto: processor for an array with mvdr that is '
-        'longer than an eighth of the longest wave (frequency_min), else band', choices=PULSES)
+        'longer than an eighth of the longest wave (frequency_min), else band, or for traces with '
+        'echoes of another width a Gaussian of the width they have', choices=PULSES)
     pulse_width: float = parameter(0.5, 'm',
         'pulse gaussian: standard deviation of the pulse', range=(1e-4, 100.0))
     pulse_file: str = parameter('', '',

@@ -29,6 +29,7 @@ changed unsaid.
 
 from __future__ import annotations
 
+from functools import lru_cache
 import math
 from typing import Annotated, ClassVar
 
@@ -58,24 +59,23 @@ _PRIOR = np.multiply.outer(np.multiply.outer(_WRONG, STEPS_PRIOR), BENDS**0.0 / 
 
 @define(eq=False)
 class DatumError:
-    """Changes (n,) of depth, m, that reflectors of two records have in common. STATE: see
-    `trackers.Tracker`. followed: standard deviation with which the error became a state, m;
+    """Changes of depth, m, that reflectors of two records have in common, and their noise, (n, 2).
+    STATE: see `trackers.Tracker`. followed: standard deviation with which the error is a state, m;
     _heave: that was taken off the last record, m; _jumps: in how many records all jumped far, and
     _last, by how many m in the last of them."""
 
     STATE: ClassVar = ('_changes', 'followed', '_heave', '_jumps', '_last')
 
-    _changes: Annotated[FloatArray, 'n'] = field(init=False, factory=lambda: np.empty(0))
+    _changes: Annotated[FloatArray, 'n2'] = field(init=False, factory=lambda: np.empty((0, 2)))
     followed: float = field(init=False, default=0.0)
     _heave: float = field(init=False, default=0.0)
     _jumps: int = field(init=False, default=0)
     _last: float = field(init=False, default=0.0)
-    _weights: FloatArray | None = field(init=False, default=None)
 
-    def add(self, change: float) -> None:
-        """One more record; its change, as it is seen from the array that is told."""
-        self._changes = np.append(self._changes[1 - CHANGES :], change)
-        self._weights = None
+    def add(self, change: float, noise: float = 0.0) -> None:
+        """One more record; its change, as it is seen from the array that is told, and the variance
+        of its depth as that follows from the reflectors' own, m^2."""
+        self._changes = np.vstack([self._changes[1 - CHANGES :], [change, noise]])
 
     def note(
         self,
@@ -89,16 +89,20 @@ class DatumError:
         """Take the reflectors of one more record, with `ids` (K,) those that were `known`; array:
         what moves the floor of a profiler is its ship."""
         before = {e.track_id: e.depth for e in known.reflectors if not e.missed + e.absent}
-        moved = [z - before[i] for i, z in zip(ids.tolist(), found.depth) if i in before]
+        seen = zip(ids.tolist(), found.depth, found.relative_variance)
+        moved = np.array([(z - before[i], 1.0 / v) for i, z, v in seen if i in before])
         if abs(found.probable_jump) > TURN_REACH * config.slope_std and len(moved) > 1:
             self._jumps, self._last = self._jumps + 1, found.probable_jump
-        if moved and array:
-            self.add(float(np.mean(moved)) + found.heave - self._heave)
+        if len(moved) and array:
+            # A reflector that is seen well counts as much as all that are not.
+            change, precision = np.average(moved[:, 0], weights=moved[:, 1]), moved[:, 1].sum()
+            self.add(float(change) + found.heave - self._heave, float(1.0 / precision))
         self._heave = found.heave
 
     def require(self) -> None:
         """Raise ValueError where the state, which may come from a file, is impossible."""
         good = np.isfinite(self._changes).all() and 0.0 <= self.followed <= MOST
+        good = good and bool((self._changes[:, 1] >= 0.0).all())
         numbers = self._last, self._heave
         if not (good and self._jumps >= 0 and all(map(math.isfinite, numbers))):
             raise ValueError('no array is as deep as that')
@@ -106,9 +110,7 @@ class DatumError:
     @property
     def weights(self) -> FloatArray:
         """Posterior (15 + 1,) of `ERRORS`."""
-        if self._weights is None:
-            self._weights = error_weights(self._changes)
-        return self._weights
+        return _weights_of(self._changes.tobytes())
 
     @property
     def found(self) -> float:
@@ -159,15 +161,21 @@ class DatumError:
         return found
 
 
+@lru_cache(maxsize=8)
+def _weights_of(changes: bytes) -> FloatArray:
+    return error_weights(np.frombuffer(changes).reshape(-1, 2))
+
+
 def error_weights(changes: FloatArray) -> FloatArray:
-    """Posterior (16,) of `ERRORS`, from what reflectors change by together (n,), m. The state of
-    each filter is the slope g and the last error e: their means, variances and covariance."""
-    e2, q2, b2 = (x.ravel() for x in np.meshgrid(*_VARIANCES, indexing='ij'))
+    """Posterior (16,) of `ERRORS`, from what reflectors change by together and the variance of
+    their depth, (n, 2), m and m^2. The state of each filter is the slope g and the last error e,
+    with that of the reflectors: their means, variances and covariance."""
+    s2, q2, b2 = (x.ravel() for x in np.meshgrid(*_VARIANCES, indexing='ij'))
     log_weight = np.log(_PRIOR)
-    g, e, eg = np.zeros((3, len(e2)))
-    gg, ee = np.full(len(e2), _FIRST_SLOPE**2), e2
-    for change in changes:
-        gg = gg + b2
+    g, e, eg = np.zeros((3, len(s2)))
+    gg, ee = np.full(len(s2), _FIRST_SLOPE**2), s2 + (changes[0, 1] if len(changes) else 0.0)
+    for change, noise in changes:
+        gg, e2 = gg + b2, s2 + noise
         S = gg - 2.0 * eg + ee + e2 + q2
         y = change - (g - e)
         density = (1.0 - _FAULT) * np.exp(-0.5 * np.square(y) / S) / np.sqrt(2.0 * np.pi * S)

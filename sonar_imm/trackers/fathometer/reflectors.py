@@ -345,6 +345,16 @@ class Reflectors:
         return np.asarray(np.maximum(self.covariance[:, 0, 0] - self.datum_std**2, 1e-6))
 
 
+@frozen(eq=False)
+class Taken:
+    """A record that was taken in: what was seen, how it was named, and by how many m all jumped
+    since the one before."""
+
+    response: Response
+    named: tuple[Identified, ...]
+    jump: float
+
+
 def reflectors_of(
     members: Members,
     response: Response,

@@ -20,10 +20,9 @@ from ...intake.stream import STREAM_TYPES
 from ...measurements import CrossSpectra, Pressure, Trace
 from .multiples import Multiples, Seen
 from .pressure import Beginning, Pace
-from .reflectors import Identified, Identities
+from .reflectors import Identified, Identities, Taken
 from .response import Lattice, Response
 from .slopes import Slope
-from .tracker import Taken
 from .water import SeenFloor
 
 STATE_TYPES = (

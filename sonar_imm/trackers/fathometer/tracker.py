@@ -43,10 +43,10 @@ from collections.abc import Collection
 import math
 from typing import Any
 
-from attrs import evolve, frozen
+from attrs import evolve
 import numpy as np
 
-from ...acoustics.pulse import independent_samples
+from ...acoustics.pulse import independent_samples, Pulse
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import LagSmoother, SetFilter, SetStep, Weighted
@@ -76,11 +76,11 @@ from .pressure import (
 )
 from .reflectors import (
     IdArray,
-    Identified,
     Identities,
     nearest_ids,
     Reflectors,
     reflectors_of,
+    Taken,
     write_estimate,
 )
 from .response import (
@@ -102,20 +102,11 @@ from .response import (
 )
 from .slopes import slopes_followed
 from .water import Water
+from .width import EchoWidth
 
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
 LONGEST_GAP = 5000
-
-
-@frozen(eq=False)
-class Taken:
-    """A record that was taken in: what was seen, how it was named, and by how many m all jumped
-    since the one before."""
-
-    response: Response
-    named: tuple[Identified, ...]
-    jump: float
 
 
 class FathometerTracker:
@@ -129,7 +120,7 @@ class FathometerTracker:
     STATE = (
         *('response', 'refusals', '_stream', '_pace', '_ids', '_depths', '_places'),
         *('_hydrophones', '_pressure', '_multiples', '_lattice', '_before', '_smoother'),
-        *('_taken', '_health', '_fit', '_phones', '_water', '_datum'),
+        *('_taken', '_health', '_fit', '_phones', '_water', '_datum', '_width'),
     )
 
     response: Response | None
@@ -151,16 +142,25 @@ class FathometerTracker:
     _phones: PhoneFaults
     _water: Water
     _datum: DatumError
+    _width: EchoWidth
     _own: FathometerConfig
 
     def __init__(self, config: FathometerConfig):
         self.config = config
-        self.pulse = pulse_of(config)
+        self._pulse = pulse_of(config)
         self.reset()
 
+    @property
+    def pulse(self) -> Pulse:
+        """Of one reflector, unless a response has its own."""
+        return pulse_of(self._own) if self._width.followed else self._pulse
+
+    def _effective(self) -> FathometerConfig:
+        """Return the parameters with the pulse and the heave that are used."""
+        return self._datum.effective(self._width.effective(self.config))
+
     def reset(self) -> None:
-        rules = StreamRules.of(self.config)
-        self._stream = OnceStream((Pressure, CrossSpectra, Trace), rules)
+        self._stream = OnceStream((Pressure, CrossSpectra, Trace), StreamRules.of(self.config))
         self.counts = self._stream.counts
         self.response, self.refusals = None, {}
         self._ids = Identities()
@@ -170,8 +170,8 @@ class FathometerTracker:
 
     def _forget(self) -> None:
         """Begin anew, but for counts and ids."""
-        self._datum = DatumError()
-        self._own = self._datum.effective(self.config)
+        self._datum, self._width = DatumError(), EchoWidth()
+        self._own = self._effective()
         self._hydrophones = self.config.phones
         self._pace = Pace()
         self._pressure = PressureStream(self.config, self.counts)
@@ -192,8 +192,9 @@ class FathometerTracker:
     def restored(self) -> None:
         """Build anew what follows from the lattice, after a state was put in."""
         self._datum.require()
+        self._width.require()
         self._ids.require()
-        self._own = self._datum.effective(self.config)
+        self._own = self._effective()
         self._water.require()
         if self._lattice is None:
             if self._before is not None:
@@ -212,7 +213,7 @@ class FathometerTracker:
         self.config.require_changeable(config)
         heave_differs = config.array_depth_std != self.config.array_depth_std
         self.config = self._water.config = config
-        self._own = config = self._datum.effective(config)
+        self._own = config = self._effective()
         if self._lattice is not None:
             self._settled = config.settled(self._lattice.hydrophones)
         if self.config.heave in ('independent', 'memory') and heave_differs:
@@ -245,9 +246,11 @@ class FathometerTracker:
 
     def health(self) -> dict[str, float]:
         """Numbers of the last record: effective sample size, log evidence against an empty one,
-        noise, most probable number of reflectors; and hydrophones left out, snapshots waiting,
-        what was corrected of hydrophones."""
+        noise, most probable number of reflectors; pulse that was measured, m; and of hydrophones
+        what was left out and corrected, and snapshots waiting."""
         waiting = {'snapshots_waiting': float(self._pressure.waiting)}
+        if self._width.followed:
+            waiting['pulse_width'] = self._width.followed
         return {**self._health, **waiting, **self._phones.health()}
 
     def warnings(self) -> list[str]:
@@ -294,14 +297,18 @@ class FathometerTracker:
         if isinstance(item, Trace):
             depth = self._array_depth(item, 0)
             if self._lattice is None:
-                lattice = lattice_of_trace(item, self._own)
                 self._water.begin(item)
-                self._begin(lattice)
+            fits = self._water.active or not self._width.take(item, self.config, self._pulse)
+            self._own = self._effective()
+            if self._lattice is None:
+                self._begin(lattice_of_trace(item, self._own))
             elif wider := widened(self._lattice, item, self._own):
                 self._begin_anew(wider)
                 if self._water.active:
                     own = wider.depth
                     self._water = self._water.widened(float(own[0]), float(own[-1]))
+            elif not fits:
+                self._begin_anew(self._lattice)
             assert self._padded is not None
             reference = math.nan if depth is None else depth
             response = trace_response(item, self._padded, self._own, reference, self._water)
@@ -366,13 +373,12 @@ class FathometerTracker:
         return array_response(record, self._padded, self._settled, depth)
 
     def _begin(self, lattice: Lattice) -> None:
-        settled = self._own.settled(lattice.hydrophones)
         try:
             model = self._set_model(lattice)
             self._filter = SetFilter(model, self._own.particles, self._own.threads)
         except ValueError as error:
             raise Rejection('too_crowded', str(error)) from None
-        self._lattice, self._settled = lattice, settled
+        self._lattice, self._settled = lattice, self._own.settled(lattice.hydrophones)
         self._padded = lattice.padded(self._filter.model.pad)
 
     def _set_model(self, lattice: Lattice) -> SetModel:
@@ -411,7 +417,8 @@ class FathometerTracker:
         if response.noise_unknown:
             found, _ = self._summarise(step, response)
             away = response.depth[:, None] - (found.depth + found.heave)
-            response = residual_sigma(response, self.pulse(away) @ found.amplitude)
+            pulse = response.pulse or self.pulse
+            response = residual_sigma(response, pulse(away) @ found.amplitude)
             step = self._cycle(response, records)
         self.response = response
         return response, step, records, self._pace.after(response.stamp_ns, place)
@@ -518,23 +525,18 @@ class FathometerTracker:
         before = datum.followed
         if not datum.follow(self.config):
             return
-        self._own = datum.effective(self.config)
+        self._own = self._effective()
         try:
             lattice.require(self._own)
-            self._begin(lattice)
+            self._begin_anew(lattice)
         except (ValueError, Rejection):
             datum.followed = before
-            self._own = datum.effective(self.config)
+            self._own = self._effective()
             self._begin(lattice)
-            return
-        self._forget_sets()
 
     def _begin_anew(self, lattice: Lattice) -> None:
-        """Go on with other depths. The reflectors keep their ids."""
+        """Go on with other depths or parameters. The reflectors keep their ids."""
         self._begin(lattice)
-        self._forget_sets()
-
-    def _forget_sets(self) -> None:
         self._before = None
         self._smoother = LagSmoother(self.config.smoothing_lag)
         self._taken.clear()
@@ -599,9 +601,7 @@ class FathometerTracker:
         separation = self._filter.model.separation
         modes = bool(self._water.active)
         members = find_members(sums, separation, most, self._own.existence_min, modes=modes)
-        heave = None
-        if shift:
-            heave = self._lattice.step * shift[0], self._lattice.step * shift[1]
-        pulse = response.pulse or self.pulse
+        pulse, cell = response.pulse or self.pulse, self._lattice.step
+        heave = (cell * shift[0], cell * shift[1]) if shift else None
         common = heave, self._error_of_depth, jump
         return reflectors_of(members, response, self._lattice, pulse, self._own, *common), pmf

@@ -46,7 +46,7 @@ def test_errors_of_the_vectors():
 
 def test_weights_are_those_of_the_joint_normal_density():
     rng = np.random.default_rng(2)
-    n, changes = 6, 0.1 * rng.standard_normal(6)
+    n, changes, noise = 6, 0.1 * rng.standard_normal(6), np.full(7, 0.03**2)
     one = np.ones((n, n))
     difference = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
     sums = np.tril(one)
@@ -56,12 +56,13 @@ def test_weights_are_those_of_the_joint_normal_density():
         for step, likely in zip(STEPS, STEPS_PRIOR):
             for bend in BENDS:
                 covariance = 0.4**2 * one + bend**2 * sums @ sums.T + step**2 * np.eye(n)
-                covariance += error**2 * difference @ difference.T
+                covariance += difference @ np.diag(error**2 + noise) @ difference.T
                 sum_of_one += likely * multivariate_normal(cov=covariance).pdf(changes)
         seen.append(prior * sum_of_one)
         total += seen[-1]
     # A fault is possible at each change, which costs the density .005.
-    assert error_weights(changes) == pytest.approx(np.array(seen) / total, abs=0.01)
+    found = error_weights(np.column_stack([changes, noise[1:]]))
+    assert found == pytest.approx(np.array(seen) / total, abs=0.01)
 
 
 def test_what_is_found_of_an_error_a_slope_and_a_fault():

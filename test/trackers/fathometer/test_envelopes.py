@@ -100,7 +100,9 @@ def test_the_first_return_keeps_its_name_on_a_wall():
 
 
 def test_a_wrong_pulse_is_said_with_its_remedy(scene):
-    tracker, _ = track(scene, FathometerConfig(noise_sigma=0.02, particles=300, water='off'))
+    tracker, _ = track(
+        scene, FathometerConfig(noise_sigma=0.02, particles=300, water='off', pulse='band')
+    )
     sentences = ' '.join(tracker.warnings())
     assert 'envelopes need water auto' in sentences and 'no set of reflectors' in sentences
     tracker, _ = track(scene, stated(particles=300))

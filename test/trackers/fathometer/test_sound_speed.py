@@ -58,7 +58,10 @@ def test_what_is_common_and_what_is_relative_add_up(drawn):
     common = np.array([each.extras['depth_common_std'] for each in estimates])
     relative = np.array([each.extras['depth_relative_std'] for each in estimates])
     assert common**2 + relative**2 == pytest.approx(variance, rel=1e-3)
-    assert common**2 - 0.03**2 == pytest.approx(((depth - ARRAY) / 300.0) ** 2, rel=1e-9)
+    # The rest is the depth of the array, of which a few records say less than many.
+    array = common**2 - ((depth - ARRAY) / 300.0) ** 2
+    assert array == pytest.approx(np.tile(array[:, :1], array.shape[1]), abs=1e-9)
+    assert array.max() < 0.04**2 and array[3:] == pytest.approx(0.03**2, abs=1e-9)
     thickness = np.diff(depth) - np.diff(truth)
     spread = np.sqrt(relative[:, 1:] ** 2 + relative[:, :-1] ** 2)
     assert np.mean(np.abs(thickness) <= 2.0 * spread) > 0.9
