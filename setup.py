@@ -57,6 +57,7 @@ EXTRAS = {
         'filterpy',
         'hypothesis',
         'laspy[lazrs]>=2.5',
+        'obspy>=1.4.1',
         'pillow>=9.1',
         'pyais>=2.7',
         'pyarrow>=14',

@@ -135,6 +135,7 @@ GONE: dict[str, str] = {
         )
         for name in ('height_bank', 'scatter_bank')
     },
+    'parameter engine': 'was removed: each set has one (parameter model_set)',
     'parameter shadow_gate': 'was removed: 1 is no gate (parameter gate_false_alarm)',
     **{
         f'parameter {name}': 'was removed: terrain, the default, has models of rough floor'

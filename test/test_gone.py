@@ -35,6 +35,7 @@ OF_SYSTEM = {
             *('variant', 'sigma_reference_bin', 'rough_sigma', 'scatters', 'grid_step'),
             *('grid_extent', 'initial_slope_std', 'redrawn_slope_std', 'multipath_level_db'),
             *('likelihood', 'max_extrapolation', 'initial_mean', 'initial_std', 'shadow_gate'),
+            'engine',
         ),
         'bathymetry',
     ),

@@ -170,7 +170,17 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
     without_key = {
-        *('laspy', 'pyais', 'pyarrow', 'pynmea2', 'pyogrio', 'pyxtf', 'segyio', 'soundfile'),
+        *(
+            'laspy',
+            'obspy',
+            'pyais',
+            'pyarrow',
+            'pynmea2',
+            'pyogrio',
+            'pyxtf',
+            'segyio',
+            'soundfile',
+        ),
     }
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 

@@ -6,7 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Real nodes beside the command: live in lock-step and offline are the same."""
+"""Real nodes beside the command: live in lock-step and offline are the same.
+
+The command starts and ends the node itself: that is what is tried.
+"""
 
 import csv
 import json

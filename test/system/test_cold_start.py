@@ -6,7 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Real nodes and their kernels, with the defaults, from an empty folder or a damaged one."""
+"""Real nodes and their kernels, with the defaults, from an empty folder or a damaged one.
+
+What is compiled or loaded already stays so in a process of tests.
+"""
 
 import contextlib
 from pathlib import Path

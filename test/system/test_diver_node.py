@@ -6,7 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The real diver node as a process: lock-step against offline, signals, bad parameters."""
+"""The real diver node as a process: lock-step against offline, signals, bad parameters.
+
+Exit codes, signals and what comes over the middleware are those of a process alone.
+"""
 
 import signal
 import subprocess

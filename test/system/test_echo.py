@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""``echo`` beside a real node."""
+"""``echo`` beside a real node: discovery of publishers needs two processes."""
 
 import json
 import os

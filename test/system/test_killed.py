@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""A process that is killed leaves nothing that looks whole."""
+"""A process that is killed leaves nothing that looks whole; only a process can be killed."""
 
 import math
 import os

@@ -64,8 +64,8 @@ class BathymetryConfig(MountingParameters):
     # -- which models ----------------------------------------------------------------------------
     model_set: str = live('terrain', '',
         'terrain models run side by side: terrain has models of its own for smooth and rough '
-        'floors, height_two_rw with engine particles is the filter of the paper; an array that '
-        'looks down (tilt_deg of 60 or more) runs angle_two_rw in place of terrain',
+        'floors, height_two_rw runs the particle filter of the paper; an array that looks down '
+        '(tilt_deg of 60 or more) runs angle_two_rw in place of terrain',
         choices=MODEL_SETS)
     sigmas: tuple[float, ...] = live((), '',
         'process noise of each model over a range bin, in the order of model_set: m, but 1/m for '
@@ -154,7 +154,7 @@ class BathymetryConfig(MountingParameters):
         range=(-60.0, 60.0))
 
     # -- computation -----------------------------------------------------------------------------
-    engine: str = live('auto', '',
+    engine: str = constant('auto', '',
         'gaussian (for terrain alone), particles, or grid (exact, without Monte Carlo noise, for '
         'sets of one state); auto: gaussian for terrain, else particles',
         choices=('auto', 'gaussian', 'particles', 'grid'))
@@ -168,8 +168,8 @@ class BathymetryConfig(MountingParameters):
         'sonar_height_std; a grid of angles holds all that are possible', range=(0.1, 1000.0))
     smoothing: str = live('auto', '',
         'use of the whole ping for each bin: none, modes (Kim: the model probabilities only) or '
-        'states (outward and inward, everything: terrain and the grid); auto: states for terrain, '
-        'else none', choices=('auto', 'none', 'modes', 'states'))
+        'states (outward and inward, everything: terrain alone); auto: states for terrain, else '
+        'none', choices=('auto', 'none', 'modes', 'states'))
     ping_coupling: float = live(0.0, '',
         'strength with which the model labels of neighbouring pings influence each other; 0: not '
         'at all, 0.15 to 0.35 suit most; needs smoothing; estimates come one ping late, heights '
@@ -242,13 +242,12 @@ class BathymetryConfig(MountingParameters):
             )
         if self.smoothing == 'states' and not (self.runs_on_grid or self.is_terrain):
             problems.append(
-                'smoothing of the states needs model_set terrain or engine grid; particles smooth '
-                'modes'
+                'smoothing of the states needs model_set terrain; other sets smooth modes'
             )
         if self.ping_coupling > 0.0 and self.smoothing_used == 'none':
             problems.append(
                 'ping_coupling needs what a whole ping says of each bin: smoothing states (model '
-                'set terrain, or engine grid) or modes'
+                'set terrain) or modes'
             )
         return problems
 

@@ -77,7 +77,7 @@ def test_without_truth_the_page_still_says_something(tracked, bag, tmp_path):
         {'model_set': 'angle_two_rw'},
         {'model_set': 'terrain'},
         {'model_set': 'height_rw_ncs'},
-        {'model_set': 'height_two_rw', 'engine': 'grid', 'smoothing': 'states'},
+        {'model_set': 'height_two_rw', 'smoothing': 'modes'},
     ],
 )
 def test_every_model_set_is_judged(bag, tmp_path, values):

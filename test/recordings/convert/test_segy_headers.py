@@ -91,6 +91,23 @@ def test_samples_of_every_format_in_either_order(tmp_path, code, order):
 
 
 @pytest.mark.parametrize('order', ['>', '<'])
+@pytest.mark.parametrize('code', [1, 2, 3, 5])
+def test_segyio_and_obspy_read_the_same_values(tmp_path, code, order):
+    """In the formats that obspy has; those are all of revision 1 but one."""
+    segy = pytest.importorskip('obspy.io.segy.segy')
+    path = write(tmp_path / 'line.sgy', order, code, interval=50, day=60, x=900_123, delay=20)
+    line, other = read_segy(path), segy._read_segy(str(path)).traces
+    assert [each.data.tolist() for each in other] == line.amplitude.tolist()
+    for k, each in enumerate(trace.header for trace in other):
+        assert line.interval[k] == each.sample_interval_in_ms_for_this_trace * 1e-6
+        assert line.delay[k] == each.delay_recording_time * 1e-3
+        assert line.longitude[k] == pytest.approx(each.source_coordinate_x / 360_000)
+        begin = datetime(each.year_data_recorded, 1, 1, each.hour_of_day, tzinfo=timezone.utc)
+        days = (each.day_of_year - 1) * 86_400
+        assert line.stamps[0] == (round(begin.timestamp()) + days) * 10**9
+
+
+@pytest.mark.parametrize('order', ['>', '<'])
 def test_the_byte_order_constant_of_revision_2(tmp_path, order):
     exact = bytearray(write(tmp_path / 'line.sgy', order, revised=True).read_bytes())
     struct.pack_into(order + 'd', exact, 3272, 62.5)

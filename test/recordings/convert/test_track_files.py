@@ -85,16 +85,9 @@ def lines_text():
     features = []
     for wanted in ('anna', 'bert'):
         own = [row for row in ROWS if row[0] == wanted]
-        features.append(
-            {
-                'type': 'Feature',
-                'geometry': {
-                    'type': 'LineString',
-                    'coordinates': [[r[3], r[2], r[4]] for r in own],
-                },
-                'properties': {'coordTimes': [row[1] for row in own], 'id': wanted},
-            }
-        )
+        places = {'type': 'LineString', 'coordinates': [[r[3], r[2], r[4]] for r in own]}
+        known = {'coordTimes': [row[1] for row in own], 'id': wanted}
+        features.append({'type': 'Feature', 'geometry': places, 'properties': known})
     return json.dumps({'features': features, 'type': 'FeatureCollection'})
 
 

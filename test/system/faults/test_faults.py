@@ -6,7 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Every fault of the table, done to a real node: in the short form to one node each, in turn."""
+"""Every fault of the table, done to a real node: in the short form to one node each, in turn.
+
+Queues, services, clocks and the log are those of the node as it is started.
+"""
 
 from pathlib import Path
 import re

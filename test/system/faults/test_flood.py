@@ -6,7 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Input at ten times what a node can process, at the pace of the clock instead of in lock-step."""
+"""Input at ten times what a node can process, at the pace of the clock instead of in lock-step:
+sender and node need a processor each."""
 
 from __future__ import annotations
 

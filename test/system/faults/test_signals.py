@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Signals at random moments of a node's life, and the start after them."""
+"""Signals at random moments of a node's life, and the start after them: they end a process."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@
 
 """Where the filter starts, and near nadir."""
 
+from attrs import evolve
 from helpers.bathymetry_cases import floor
 import numpy as np
 import pytest
@@ -24,7 +25,8 @@ WATER = 5.0 + 0.05 * np.arange(900)
 def run(name, values, **config):
     made = scenario(name, values)
     scene = simulate(made, 1)
-    tracker = BathymetryTracker(BathymetryConfig.from_mapping({**made.instruments(), **config}))
+    stated = BathymetryConfig.from_mapping(made.instruments())
+    tracker = BathymetryTracker(evolve(stated, **config))
     pings = [tracker.process(each.measurement) for each in scene.measurements]
     return [each for ping in pings for each in ping], scene.truth
 

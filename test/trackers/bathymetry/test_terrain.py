@@ -398,7 +398,7 @@ def test_nothing_but_noise_is_the_start():
 )
 def test_parameters_of_other_sets_are_refused_by_name(values, words):
     with pytest.raises(ConfigError, match=words):
-        BathymetryConfig.from_mapping({'model_set': 'terrain', **values})
+        BathymetryConfig(**{'model_set': 'terrain', **values})
 
 
 SLOPES_OF_FLOORS = {'flat': 0.0, 'rises': 0.18, 'falls': -0.28}

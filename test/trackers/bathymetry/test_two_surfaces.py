@@ -38,7 +38,7 @@ def step(at=slice(150, 200), up=2.0, **more):
 
 
 def run(snapshot, layover='resolved', **values):
-    tracker = BathymetryTracker(BathymetryConfig.from_mapping({'layover': layover, **values}))
+    tracker = BathymetryTracker(BathymetryConfig(layover=layover, **values))
     return tracker, tracker.process(snapshot)[0]
 
 

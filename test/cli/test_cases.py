@@ -1,0 +1,356 @@
+# Copyright 2026 The sonar_imm developers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+
+
+"""Inputs that people have, and what is right: a row for each, with its commands and its value.
+
+Rows that need a whole run stand here; those of one reader stand in its own test (`ELSEWHERE`).
+"""
+
+from collections.abc import Callable
+import csv
+import math
+from pathlib import Path
+import re
+import sys
+from typing import NamedTuple
+
+from helpers import case_files as made
+import numpy as np
+import pytest
+
+from sonar_imm_tools.cli import main
+
+TEST = Path(__file__).resolve().parents[1]
+ELSEWHERE = [
+    ('fraction_beside', 'recordings/test_times.py', 'the_fraction_of_a_second_beside'),
+    (
+        'burst_of_a_second',
+        'recordings/convert/test_detections.py',
+        'pings_within_a_second_are_not_joined',
+    ),
+    (
+        'nmea_usbl',
+        'recordings/convert/test_nmea.py',
+        'targets_of_a_usbl_are_placed_from_the_vessel',
+    ),
+    (
+        'nmea_without_zeros',
+        'recordings/convert/test_nmea.py',
+        'a_time_that_cannot_be_read_takes_no_other_stamp',
+    ),
+    (
+        'ais_without_times',
+        'recordings/convert/test_nmea.py',
+        'the_date_is_advised_only_where_it_helps',
+    ),
+    ('german_headers', 'recordings/test_columns.py', 'headers_in_six_languages'),
+    ('hemispheres', 'recordings/test_columns.py', 'degrees_in_every_spelling'),
+    ('hhmmss', 'recordings/test_times.py', 'times_of_day_in_one_number_pass_minutes_and_hours'),
+    (
+        'east_zero',
+        'recordings/test_columns.py',
+        'columns_that_are_zero_throughout_give_way_to_filled_ones',
+    ),
+    ('matlab_dates', 'recordings/test_times.py', 'forms_of_dates_and_times'),
+    ('zero_zero (target)', 'msg_adapters/test_fixes.py', 'latitude_0_longitude_0_is_no_fix'),
+    (
+        'slow_scan',
+        'msg_adapters/test_detections.py',
+        'the_rays_of_a_laser_scan_have_times_and_its_stamp_is_the_last_one',
+    ),
+    ('picture_of_the_fan', 'msg_adapters/test_fans.py', 'a_fan_gives_ranges_by_beams'),
+    (
+        'image_and_odometry',
+        'cli/test_frames.py',
+        'the_only_odometry_beside_detections_is_found_by_its_type',
+    ),
+    ('unknown_usbl_type', 'cli/test_info.py', 'a_type_that_nobody_hears_names_what_would_do'),
+    ('folder_not_utf8', 'cli/test_names.py', 'any_locale_will_do'),
+    (
+        'hostile_parameters',
+        'cli/test_stranger.py',
+        'a_recording_keeps_no_files_and_changes_no_node',
+    ),
+    ('hostile_state', 'trackers/test_state.py', 'the_file_is_named_arrays_and_json'),
+    ('endless_coverage', 'cli/test_stranger.py', 'a_file_that_a_recording_names_lies_beside_it'),
+    ('segy_delay', 'recordings/convert/test_segy_headers.py', 'the_recording_delay_of_each_trace'),
+    (
+        'segy_interval',
+        'recordings/convert/test_segy_headers.py',
+        'the_sample_interval_of_each_trace_or_of_the_file',
+    ),
+    (
+        'segy_local_time',
+        'recordings/convert/test_segy_headers.py',
+        'local_times_ask_for_their_zone',
+    ),
+    (
+        'segy_no_date',
+        'recordings/convert/test_segy_headers.py',
+        'traces_without_a_date_begin_when_the_user_says',
+    ),
+    (
+        'segy_little_endian',
+        'recordings/convert/test_segy_headers.py',
+        'samples_of_every_format_in_either_order',
+    ),
+    (
+        'segy_places',
+        'recordings/convert/test_segy_headers.py',
+        'places_are_used_or_the_sentence_says_why_not',
+    ),
+    (
+        'segy_no_traces',
+        'recordings/convert/test_segy_headers.py',
+        'a_file_without_a_whole_trace_is_one_sentence',
+    ),
+    (
+        'snapshots_with_places',
+        'recordings/convert/test_archives.py',
+        'places_and_attitude_of_each_ping_become_navigation',
+    ),
+    ('las_time', 'cli/test_export.py', 'xyz_las_and_tif_hold_the_same_floor'),
+    (
+        'soundings_far_away',
+        'cli/test_damaged_lines.py',
+        'soundings_far_away_are_left_out_and_said',
+    ),
+    (
+        'damaged_run',
+        'cli/test_damaged_lines.py',
+        'each_damaged_line_is_named_and_left_out_and_the_chart_is_that_of_the_others',
+    ),
+]
+"""The row, and the file and the name of the test that proves it: those that one reader decides."""
+TELEMETRY = 'convert detections detections.csv b --receivers receivers.csv --time-zone UTC'
+FISH = 'track b run --set target=fish --set target_z=-3.0'
+FIXES = 'convert fixes fixes.csv b'
+ONE = 'track b run --set target=rov --set max_tracks=1'
+
+
+class Run(NamedTuple):
+    """Codes and words of the commands, and the confirmed and coasting rows of the run: seconds
+    after the begin, places (n, 2), covariances (n, 2, 2) and numbers."""
+
+    codes: list[int]
+    words: str
+    t: np.ndarray
+    place: np.ndarray
+    covariance: np.ndarray
+    track: np.ndarray
+
+    def errors(self, way):
+        return self.place - np.array([way(t) for t in self.t])
+
+    def rmse(self, way):
+        assert len(self.t) > 10
+        return math.sqrt(np.mean(np.sum(self.errors(way) ** 2, axis=1)))
+
+    def inside(self, way):
+        """The share of the truth inside the stated ellipse of 95 %."""
+        error = self.errors(way)
+        whitened = np.linalg.solve(self.covariance, error[..., None])[..., 0]
+        return np.mean(np.sum(whitened * error, axis=1) < 5.991)
+
+
+class Case(NamedTuple):
+    name: str
+    make: Callable[[Path], object]
+    commands: tuple[str, ...]
+    right: Callable[[Run], bool]
+
+
+def export(head, line, **how):
+    return lambda folder: made.detections(folder, head, line, **how)
+
+
+def dive(**how):
+    return lambda folder: made.dive(folder, **how)
+
+
+VUE = 'Date and Time (UTC),Receiver,Transmitter'
+TEXT, RMSE_FISH = made.text_of, lambda run: run.rmse(made.circle) < 0.5
+MAKERS = {
+    'otn': ('collectionCode,catalogNumber,station,receiver,tagName,codeSpace,dateCollectedUTC',
+            lambda k, t, r: f'A,A-{k},S{r[-1]},{r},A69-1-7,A69-1,{TEXT(t, 6)}'),
+    'glatos': ('animal_id,detection_timestamp_utc,transmitter_codespace,transmitter_id,'
+               'receiver_sn',
+               lambda k, t, r: f'15,{TEXT(t, 6)},A69-1,7,{r}'),
+    'lotek': ('Date,Time,TOA,Tag ID,Receiver,Power',
+              lambda k, t, r: f'{TEXT(t, 0, "%m/%d/%y,%H:%M:%S")},{t % 1:.5f},7,{r},99'),
+    'thelma': ('Date and Time (UTC),ID,Data,Protocol,SNR,Receiver,Millisecond',
+               lambda k, t, r: f'{TEXT(t, 0)},7,0,S256,20,{r},{int(t % 1 * 1000)}'),
+    'fathom': ('VEMCO DATA LOG,2.0.0,vdat\nRECORD TYPE,FIELD\nDIAG_DESC,Device Time (UTC),Noise\n'
+               'DET_DESC,Device Time (UTC),Time,Model,Serial Number,Channel,Full ID,ID',
+               lambda k, t, r: (f'DIAG,{TEXT(t, 0)},9\n' if k % 9 == 0 else '')
+               + f'DET,{TEXT(t, 6)},{TEXT(t, 6)},{r.replace("-", ",")},69,A69-1-7,7'),
+}  # fmt: skip
+
+
+def swapped(folder):
+    """A diver is missed in three scans, in which another one appears 900 m away."""
+    rng, rows = np.random.default_rng(5), []
+    for k in range(45):
+        for y in [0.0] if k < 30 else [900.0] if k < 33 else [0.0, 900.0]:
+            rows.append((k + 1, 0.4 * k + 0.7 * rng.normal(), y + 0.7 * rng.normal(), 0.7))
+    made.fixes(folder, rows)
+
+
+def keeps_numbers_apart(run):
+    sides = [set(run.track[run.place[:, 1] < 450.0]), set(run.track[run.place[:, 1] > 450.0])]
+    return [len(side) for side in sides] == [1, 1] and not sides[0] & sides[1]
+
+
+def reflections(folder):
+    rng = np.random.default_rng(6)
+    late, left = set(), 0
+    for k in range(20, 240):
+        left = left - 1 if left else 6 if rng.random() < 0.05 else 0
+        late |= {k} if left else set()
+    made.dive(
+        folder,
+        240,
+        offset=lambda k: [rng.uniform(15, 40), rng.uniform(-5, 5)] if k in late else [0.0, 0.0],
+        step=2.0,
+    )
+
+
+def held(folder):
+    rng, rows = np.random.default_rng(7), []
+    for k in range(400):
+        if k % 8 == 0:
+            value = made.swim(k) + 1.5 * rng.normal(size=2)
+        rows.append((k, *value, 1.5))
+    made.fixes(folder, rows)
+
+
+def unstated(folder):
+    rng = np.random.default_rng(8)
+    rows = [(t, *(made.swim(t) + 4.0 * rng.normal(size=2))) for t in range(0, 400, 2)]
+    made.fixes(folder, rows, 'time,x,y')
+
+
+def polled(folder):
+    """Three fish in turn, each fix with a stamp of its own."""
+    rng, rows = np.random.default_rng(9), []
+    for n in range(360):
+        t, phase = n / 3, 2.0 * (n % 3)
+        x, y = 8 * math.cos(t / 12 + phase) + 6 * (n % 3), 8 * math.sin(t / 12 + phase)
+        rows.append((t, x + 0.3 * rng.normal(), y + 0.3 * rng.normal(), 0.3))
+    made.fixes(folder, rows)
+
+
+def odd_waypoint(folder):
+    points = ''.join(
+        f'<trkpt lat="43.3" lon="{5.3 + 1e-5 * k:.6f}"><time>2021-01-01T00:00:{k:02d}</time>'
+        '</trkpt>'
+        for k in range(50)
+    )
+    (folder / 'track.gpx').write_text(
+        '<gpx xmlns="http://www.topografix.com/GPX/1/1"><wpt lat="43.3" lon="5.3"/>'
+        f'<trk><trkseg>{points}</trkseg></trk></gpx>'
+    )
+
+
+def moving_vessel(folder):
+    head = 'Tid (UTC);Båt bredde;Båt lengde;Kurs;Navn;Avstand [m];Peiling [°];Dybde'
+    rows = [
+        f'{TEXT(made.BEGIN + k, 0)};43,31{k:04d};5,36;{80 + k % 9},5;Ola;{40 + 0.5 * k:.1f};{k}'
+        ';3,0'.replace('.', ',')
+        for k in range(60)
+    ]
+    (folder / 'usbl.csv').write_text('\n'.join([head, *rows]) + '\n', encoding='utf-8')
+
+
+def commas(folder):
+    rows = [f'"{k}","{2.5 + k / 10:.1f}","3,0"'.replace('.', ',') for k in range(30)]
+    (folder / 'fixes.csv').write_text('\n'.join(['\ufeff"time","x","y"', *rows]) + '\n', 'utf-8')
+
+
+def attitude(*variances):
+    return lambda folder: made.by_vessel(folder / 'b', made.odometry(variances))
+
+
+def times_too_small(run):
+    found = re.search(r'too small by a factor (more than )?([\d.]+)', run.words)
+    return found and (float(found[2]) >= 20 if found[1] else 50 <= float(found[2]) <= 200)
+
+
+CASES = [
+    Case('coarse_stamps', export(VUE, lambda k, t, r: f'{TEXT(t, 0)},{r},7'), (TELEMETRY,),
+         lambda run: run.codes == [2] and 'resolution of 1 s' in run.words),
+    *(Case(f'other_makers {name}', export(*maker), (TELEMETRY, FISH), RMSE_FISH if name != 'thelma'
+           else lambda run: run.rmse(made.circle) < 1.0) for name, maker in MAKERS.items()),
+    Case('burst_of_a_second tracked', export(VUE, lambda k, t, r: f'{TEXT(t, 6)},{r},7',
+         period=(1, 1), seconds=100), (TELEMETRY, FISH),
+         lambda run: len(run.t) > 85 and run.rmse(made.circle) < 0.5),
+    Case('gpx_odd_waypoint', odd_waypoint, ('convert track.gpx b',
+         'convert track.gpx c --time-zone UTC'), lambda run: run.codes == [2, 0]
+         and '--time-zone' in run.words and '50 on /fix' in run.words),
+    Case('german_vessel', moving_vessel, ('convert fixes usbl.csv b',),
+         lambda run: run.codes == [2] and 'Kurs' in run.words and 'Båt bredde' in run.words),
+    Case('quoted_decimal_comma', commas, (FIXES, 'track b run'),
+         lambda run: 3.0 < run.place[-1, 0] < 6.0 and abs(run.place[-1, 1] - 3.0) < 0.1),
+    Case('teleport', swapped, (FIXES, 'track b run'), keeps_numbers_apart),
+    Case('outliers_in_a_row', dive(offset=lambda k: [0.0, 25.0 * (k in (40, 41, 80, 81))]),
+         (FIXES, ONE), lambda run: np.linalg.norm(run.errors(made.swim), axis=1).max() < 12.5
+         and len(set(run.track)) == 1),
+    Case('multipath', reflections, (FIXES, ONE), lambda run: run.rmse(made.swim) < 3.5),
+    Case('held_values', held, (FIXES, ONE), lambda run: run.inside(made.swim) > 0.85),
+    Case('wrong_covariances small', dive(count=300, scale=0.1), (FIXES, ONE), times_too_small),
+    Case('wrong_covariances large', dive(count=300, scale=3.2), (FIXES, ONE),
+         lambda run: 'too large' in run.words),
+    Case('no_covariance', unstated, (FIXES, 'track b run --set target=rov'),
+         lambda run: 'no message states' in run.words and 'fix_std' in run.words),
+    Case('polled', polled, (FIXES, 'track b run --set target=fish'),
+         lambda run: 'scan_period' in run.words and 'covariances' not in run.words),
+    Case('two_sensors', lambda folder: made.two_sensors(folder / 'b'), (ONE,),
+         lambda run: 'offset' in run.words and np.mean(run.track == run.track[-1]) > 0.9),
+    *(Case(f'attitude_not_measured roll {variance:.3g}', attitude(variance, variance, 1e-4),
+           ('track b run',), lambda run: run.rmse(made.seen_from) < 1.5)
+      for variance in (99.0, 1e6)),
+    *(Case(f'attitude_not_measured yaw {variance:.3g}', attitude(1e-4, 1e-4, variance),
+           ('track b run',), lambda run: not len(run.t) and 'heading' in run.words)
+      for variance in (math.pi**2 / 3, sys.float_info.max)),
+    Case('zero_zero vessel', lambda folder: made.by_vessel(folder / 'b', made.satellite(9)),
+         ('track b run',), lambda run: len(run.t) > 55 and len(set(run.track)) == 1
+         and np.linalg.norm(run.errors(made.seen_from), axis=1).max() < 7.0
+         and 'no_fix' in run.words),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize('case', CASES, ids=lambda case: case.name)
+def test_a_case_is_right_or_asked(case, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    case.make(tmp_path)
+    codes = [main(command.split()) for command in case.commands]
+    printed = capsys.readouterr()
+    rows = []
+    if (table := tmp_path / 'run' / 'estimate.csv').exists():
+        with table.open() as file:
+            rows = [row for row in csv.DictReader(file) if row['track_state'] in ('1', '2')]
+    run = Run(
+        codes,
+        printed.out + printed.err,
+        np.array([int(row['stamp_ns']) * 1e-9 - made.BEGIN for row in rows]),
+        np.array([[float(row['px']), float(row['py'])] for row in rows]).reshape(-1, 2),
+        np.array(
+            [
+                [float(row[f'cov_{name}']) for name in ('px_px', 'px_py', 'px_py', 'py_py')]
+                for row in rows
+            ]
+        ).reshape(-1, 2, 2),
+        np.array([int(row['track_id']) for row in rows]),
+    )
+    assert case.right(run), run.words
+
+
+@pytest.mark.parametrize('row, path, name', ELSEWHERE)
+def test_the_test_of_each_other_row_is_there(row, path, name):
+    assert re.search(rf'^ *def test_{name}\b', (TEST / path).read_text(), re.MULTILINE), row
