@@ -52,7 +52,7 @@ def test_stone_soup_follows_the_same_floor(short):
 def test_every_variant_of_the_floor_is_measured(short):
     speed = bathymetry.bench_threads(1, 1)['bins_per_second']
     speed = {**speed, **bathymetry.bench_scaling(rounds=1)['bins_per_second']}
-    assert len(speed) == 9 and min(speed.values()) > 0.0
+    assert len(speed) == 11 and min(speed.values()) > 0.0
 
 
 def test_filterpy_does_the_same_sums_for_a_diver():

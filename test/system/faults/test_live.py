@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
+import copy
 import os
 import re
 import subprocess
@@ -36,7 +37,10 @@ class Live:
 
     def __init__(self, rig: Rig):
         self._rig = rig
-        self._fix = next(item.content for item in rig.case.messages() if item.primary)
+        # A copy, because all tests of a process share the messages of a case.
+        self._fix = copy.deepcopy(
+            next(item.content for item in rig.case.messages() if item.primary)
+        )
         place, covariance = self._fix.pose.pose.position, self._fix.pose.covariance
         self._at, self._std = (place.x, place.y), np.sqrt(covariance[[0, 7]])
         self._errors = np.random.default_rng(0)
