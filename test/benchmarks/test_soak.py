@@ -15,7 +15,7 @@ from benchmarks import soak
 
 LIMITS = {
     'diver': (0.3, 1.0),
-    'obstacle': (0.03, 1.5),
+    'obstacle': (0.3, 1.5),
     'bathymetry': (0.06, 3.0),
     'fathometer': (0.3, 10.0),  # its particles come and go by megabytes
 }

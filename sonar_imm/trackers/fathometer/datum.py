@@ -54,7 +54,9 @@ _FIRST_SLOPE = 0.4
 _TIMES, _LEAST_ERROR, _SURE, _AGAIN = 2.0, 0.05, 0.9, 1.4
 _VARIANCES = np.square(ERRORS), np.square(STEPS), np.square(BENDS)
 _WRONG = np.append(_RIGHT, np.full(len(ERRORS) - 1, (1.0 - _RIGHT) / (len(ERRORS) - 1)))
-_PRIOR = np.multiply.outer(np.multiply.outer(_WRONG, STEPS_PRIOR), BENDS**0.0 / len(BENDS)).ravel()
+_PRIOR = np.multiply.outer(
+    np.multiply.outer(_WRONG, STEPS_PRIOR), np.full(len(BENDS), 1.0 / len(BENDS))
+).ravel()
 
 
 @define(eq=False)
