@@ -194,17 +194,12 @@ def front_html(parts: Sequence[Part], links: Sequence[str]) -> str:
 
 def _pictures(parts: Sequence[Part], links: Sequence[str]) -> list[tuple[Part, str, str]]:
     """Return one run of each system, the one with most checks: with its link and picture."""
-    best: dict[str, tuple[Part, str]] = {}
+    best: dict[str, tuple[Part, str, go.Figure]] = {}
     for part, link in zip(parts, links):
-        system = part.run['system']
-        held = best.get(system)
-        if part.picture is not None and (held is None or len(part.checks) > len(held[0].checks)):
-            best[system] = part, link
-    return [
-        (part, quote(link), thumbnail(part.picture))
-        for part, link in best.values()
-        if part.picture is not None
-    ]
+        held, picture = best.get(part.run['system']), part.picture
+        if picture is not None and (held is None or len(part.checks) > len(held[0].checks)):
+            best[part.run['system']] = part, link, picture
+    return [(part, quote(link), thumbnail(picture)) for part, link, picture in best.values()]
 
 
 def _rendered(template: str, **values: Any) -> str:

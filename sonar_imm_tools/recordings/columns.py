@@ -201,7 +201,7 @@ TIME_WORDS = {
     **dict.fromkeys(('ms', 'msec', 'millis', 'milliseconds'), 'ms'),
     **dict.fromkeys(('us', 'usec', 'microseconds'), 'us'),
     **dict.fromkeys(('ns', 'nsec', 'nanoseconds'), 'ns'),
-    **dict.fromkeys(('min', 'mins', 'minute', 'minutes', 'minuten', 'minutos', 'minutter'), 'min'),
+    **dict.fromkeys(PARTS['minutes'], 'min'),
     **dict.fromkeys(('h', 'hr', 'hrs', 'hour', 'hours', 'stunden', 'heures', 'horas'), 'h'),
     **dict.fromkeys(('d', 'day', 'days', 'tage', 'jours', 'dias', 'dager'), 'd'),
 }

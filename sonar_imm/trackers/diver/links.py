@@ -113,10 +113,8 @@ def update_links(known: Known, _: Scan) -> Known:
     rows = known.rows
     if not rows.tail or not (rows.key['link'] != 0).any():
         return known
-    key = rows.key
-    status = dict(zip(known.life.track_id.tolist(), known.life.status.tolist()))
-    state = np.array([status.get(each, -1) for each in key['link'].tolist()])
-    wrong = (key['link'] > 0) & (state > TENTATIVE)
+    track_id = known.life.track_id
+    wrong = np.isin(rows.key['link'], track_id[known.life.status > TENTATIVE])
     if wrong.any():
         kept = np.where(wrong, -np.inf, rows.logw)
         left = rows.log_sum(kept)[rows.target]
@@ -125,11 +123,10 @@ def update_links(known: Known, _: Scan) -> Known:
         kept = np.where(stays, kept - np.where(stays, left, 0.0), rows.logw)
         some = np.flatnonzero(np.isfinite(kept))
         rows = evolve(rows.replace(logw=kept).select(some), parent=rows.parent[some])
-    long = (rows.key['link'] != 0) & (
-        rows.key['fixes'] >= np.minimum(LONGEST_BURST, rows.key['taken'])
-    )
-    long |= np.isin(rows.key['link'], key['link'][(key['link'] > 0) & (state < 0)])
-    return known.replace(rows=end_rows(rows, long))
+    link = rows.key['link']
+    over = (link > 0) & ~np.isin(link, track_id)
+    over |= (link != 0) & (rows.key['fixes'] >= np.minimum(LONGEST_BURST, rows.key['taken']))
+    return known.replace(rows=end_rows(rows, over))
 
 
 def existence_beside_bursts(known: Known) -> FloatArray:

@@ -64,13 +64,15 @@ class EchoWidth:
         if not math.isfinite(found):
             return False
         self._seen = np.append(self._seen, found)
+        if len(self._seen) not in LOOKS:
+            return False
         half, least = float(np.median(self._seen)), LEAST_SAMPLES * trace.step
         lag = 0.01 * least * np.arange(100.0 * max(1.0, 10.0 * half / least))
         below = np.flatnonzero(band(lag) < 0.5)
         due = float(lag[below[0]]) if len(below) else math.inf
         fits = due / TIMES < half < due * TIMES or max(half, due) < least
         width = 0.0 if fits else max(half, least) / HALF
-        if len(self._seen) not in LOOKS or abs(width - self.followed) <= CLOSE * self.followed:
+        if abs(width - self.followed) <= CLOSE * self.followed:
             return False
         self.followed = width
         span = float(trace.depth[-1] - trace.depth[0])
