@@ -25,7 +25,6 @@ import pytest
 from sonar_imm.files import UNFINISHED
 from sonar_imm_tools.offline.batch import run_folders
 from sonar_imm_tools.offline.run_folder import RunFolder
-from sonar_imm_tools.recordings.reader import BagReader
 
 pytestmark = pytest.mark.system
 MOMENTS = count(6, 20)
@@ -89,19 +88,6 @@ def test_a_killed_command_goes_on_where_it_was(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(run_folders(out)) == 8 and all(whole_run(path) for path in run_folders(out))
     assert not [path for path in out.iterdir() if UNFINISHED in path.name]
-
-
-def test_a_bag_that_is_being_written_is_not_there(tmp_path):
-    out = tmp_path / 'scene'
-    arguments = command('simulate', 'obstacle', out)
-    with subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.DEVNULL) as it:
-        while it.poll() is None and not list(tmp_path.glob(f'scene{UNFINISHED}*/scene/*.mcap')):
-            time.sleep(0.002)
-        it.send_signal(signal.SIGKILL)
-    if out.exists():  # it was faster
-        with BagReader(out) as bag:
-            assert not bag.problems
-    assert all(path.name.startswith('scene') for path in tmp_path.iterdir())
 
 
 def test_a_worker_that_is_killed_costs_a_survey_its_job_only(tmp_path):
