@@ -61,22 +61,10 @@ CONVENTIONAL: dict[str, Any] = {'frequency_min': 200.0}
 CONFIGURATIONS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     'MVDR as the paper (envelope, bootstrap), N^-m': ('envelope', ENVELOPE, PENALTY | BOOTSTRAP),
     '+ data-driven proposals': ('envelope', ENVELOPE, PENALTY),
-    '  with the pulse of the real part': ('envelope', ORDERS, PENALTY),
-    'MVDR real part, N^-m': ('mvdr', ORDERS, PENALTY),
-    'MVDR real part, N^(-m/2), 7-9': ('mvdr', ORDERS, {'amplitude_prior': 'bic_half'}),
     'MVDR real part, marginal, 1-12 (default)': ('mvdr', {}, {}),
     '  smoothed, lag 2': ('mvdr', {'smoothing_lag': 2}, {}),
     '  2,000 particles': ('mvdr', {'particles': 2000}, {}),
-    **{
-        f'fixed order {m}, {name}': ('mvdr', {'order_min': m, 'order_max': m}, changes)
-        for name, changes in (('bootstrap', BOOTSTRAP), ('data-driven', {}))
-        for m in (7, 8, 9)
-    },
-    'conventional envelope, pulse of the real part, N^-m': (
-        'conventional_envelope',
-        {**ORDERS, **CONVENTIONAL},
-        PENALTY,
-    ),
+    'fixed order 8, bootstrap': ('mvdr', {'order_min': 8, 'order_max': 8}, BOOTSTRAP),
     'conventional real part, N^-m': ('conventional', {**ORDERS, **CONVENTIONAL}, PENALTY),
     'conventional real part, amplitude memory 0.98, 1-12': (
         'conventional',
@@ -103,7 +91,6 @@ def responses(spectra: CrossSpectra) -> dict[str, Trace]:
         ('mvdr', 'mvdr', 50.0, False),
         ('envelope', 'mvdr', 50.0, True),
         ('conventional', 'conventional', 200.0, False),
-        ('conventional_envelope', 'conventional', 200.0, True),
     ):
         band = spectra.frequency >= low
         gamma = coherence(spectra.csdm[band], w[band], processor)
