@@ -15,13 +15,14 @@ These are `config/<system>.yaml`, `docs/parameters/<system>.md` and the pages wi
 from __future__ import annotations
 
 from collections.abc import Sequence
+import json
 from pathlib import Path
 import sys
 import textwrap
 
 import yaml
 
-from sonar_imm.node_config import DetectorNodeConfig, node_config_type
+from sonar_imm.node_config import DetectorNodeConfig, node_config_type, NodeConfig
 from sonar_imm.parameters import markdown_table, ParameterSpec
 from sonar_imm.trackers import System, SYSTEMS
 from sonar_imm.trackers.obstacle.detector import DetectorConfig
@@ -44,8 +45,8 @@ YAML_HEAD = """\
 MARKDOWN = """\
 # Parameters of the {what}
 
-{summary}. `config/{name}.yaml` holds all of them, ready to copy.
-*Live* ones may change while the node runs. [Types of values](nodes.md).
+{summary}. `config/{name}.yaml` holds all of them with their ranges, ready to copy.
+Those with a star may change while the node runs. [Types of values](nodes.md).
 
 ## The ten that matter
 
@@ -54,8 +55,6 @@ MARKDOWN = """\
 
 {tracker}
 ## Node
-
-Besides [those of every node](nodes.md):
 
 {node}"""
 
@@ -141,8 +140,7 @@ MATTER = {
 def generated() -> dict[str, str]:
     """Give every generated file: its text by its path below the project root."""
     files = {}
-    shared = shared_specs()
-    files['docs/parameters/nodes.md'] = NODES.format(node=markdown_table(shared))
+    files['docs/parameters/nodes.md'] = NODES.format(node=markdown_table(NodeConfig.specs()))
     for system in SYSTEMS.values():
         tracker = system.config_type().specs()
         files[f'config/{system.name}.yaml'] = parameter_file(system)
@@ -153,7 +151,7 @@ def generated() -> dict[str, str]:
             summary=system.summary[0].upper() + system.summary[1:],
             matter=matter_table(system.name, tracker),
             tracker=markdown_table(tracker),
-            node=markdown_table(spec for spec in node_specs(system) if spec not in shared),
+            node=of_this_node(node_specs(system)),
         )
     detector = DetectorConfig.specs()
     node = DetectorNodeConfig.specs()
@@ -165,7 +163,7 @@ def generated() -> dict[str, str]:
         summary=DETECTOR,
         matter=matter_table('fls_detector', detector),
         tracker=markdown_table(detector),
-        node=markdown_table(spec for spec in node if spec not in shared),
+        node=of_this_node(node),
     )
     return files | pages()
 
@@ -196,10 +194,23 @@ def node_specs(system: System) -> tuple[ParameterSpec, ...]:
     return tuple(spec for spec in node_config_type(system).specs() if spec.name not in own)
 
 
-def shared_specs() -> tuple[ParameterSpec, ...]:
-    """Give the parameters that the live nodes of all systems have alike."""
-    first, *others = (node_config_type(system).specs() for system in SYSTEMS.values())
-    return tuple(spec for spec in first if all(spec in other for other in others))
+def of_this_node(specs: Sequence[ParameterSpec]) -> str:
+    """Give what a node has of its own: other defaults, other meanings, further parameters."""
+    shared = {spec.name: spec for spec in NodeConfig.specs()}
+    own = [
+        spec
+        for spec in specs
+        if spec.name not in shared or spec.description != shared[spec.name].description
+    ]
+    defaults = [
+        f'`{spec.name}` is `{json.dumps(spec.default)}` {spec.unit}'.rstrip()
+        for spec in specs
+        if spec not in own and spec.default != shared[spec.name].default
+    ]
+    common = [f'`{spec.name}`' for spec in specs if spec not in own]
+    those = 'Those' if len(common) > 5 else ' and '.join(common)
+    parts = [f'{"; ".join([f"{those} of [every node](nodes.md)", *defaults])}.\n']
+    return '\n'.join([*parts, *([markdown_table(own)] if own else [])])
 
 
 def _entry(spec: ParameterSpec) -> str:
