@@ -73,6 +73,7 @@ GONE: dict[str, str] = {
     },
     'parameter sweep_speed': 'was removed: each direction counts at its own time',
     'parameter publish_revisions': 'was removed: max_revisions 0 leaves revisions out',
+    'parameter queue_depth': 'was removed: set qos_overrides.TOPIC.subscription.depth',
     'parameter diagnostics_period': _CONSTANT,
     'parameter state_interval': _CONSTANT,
     'parameter use_tf_static': 'was removed: remap /tf_static for a node that must not hear it',

@@ -17,7 +17,7 @@ from attrs import frozen
 from msg_adapters.inputs import inputs_of
 
 from .acoustics.geodesy import Origin
-from .parameters import Config, ConfigError, did_you_mean, inherited, live, parameter
+from .parameters import Config, ConfigError, constant, did_you_mean, inherited, live, parameter
 from .trackers import System
 from .trackers.shared_parameters import OriginParameters
 
@@ -27,7 +27,8 @@ class NodeConfig(Config):
     """Parameters of every node besides those of its tracker."""
 
     # fmt: off
-    queue_depth: int = parameter(50, '',
+    # ROS 2 has a parameter for it, qos_overrides.TOPIC.subscription.depth.
+    queue_depth: int = constant(50, '',
         'messages that an input queue holds while the tracker is busy', range=(1, 100000))
     max_wait: float = live(0.0, 's',
         'messages that waited longer are dropped and counted; 0: never',
@@ -80,7 +81,7 @@ class TracksNodeConfig(NodeConfig):
     Whoever steers by a track needs the one of now."""
 
     # fmt: off
-    queue_depth: int = inherited(NodeConfig, 'queue_depth', 500)
+    queue_depth: int = inherited(NodeConfig, 'queue_depth', 500, constant=True)
     max_wait: float = inherited(NodeConfig, 'max_wait', 2.0)
     # fmt: on
 
@@ -95,9 +96,7 @@ class DetectorNodeConfig(Config):
     """Parameters of the node that detects echoes in images, besides those of the detector."""
 
     # fmt: off
-    queue_depth: int = inherited(NodeConfig, 'queue_depth', 10,
-        description='images that an input queue holds while the node is busy',
-        range=(1, 1000))
+    queue_depth: int = inherited(NodeConfig, 'queue_depth', 10, constant=True)
     autostart: bool = inherited(NodeConfig, 'autostart', True)
     input_types: tuple[str, ...] = inherited(NodeConfig, 'input_types', (),
         description='message type of the images, e.g. image=sensor_msgs/msg/Image; empty: '
