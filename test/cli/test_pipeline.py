@@ -165,7 +165,7 @@ def test_convert_tells_what_it_left_out(call, tmp_path, capsys):
 
 def test_the_node_parameters_of_a_file_are_checked_and_ignored(call, dive, tmp_path, capsys):
     params = tmp_path / 'diver.yaml'
-    params.write_text('input_types: [fix=geometry_msgs/msg/PointStamped]\nqueue_depth: 7\n')
+    params.write_text('input_types: [fix=geometry_msgs/msg/PointStamped]\nstale_after: 7.0\n')
     run = call('track', dive, tmp_path / 'out', '--params', params)
     assert 'input_types' not in run['parameters'] and run['estimates'] == 58
     params.write_text('input_types: [fix=geometry_msgs/msg/PointStampd]\n')
@@ -199,6 +199,6 @@ def test_detections_kept_in_a_bag_give_the_same_tracks(call, tmp_path, capsys):
     tables = [(out / 'estimate.csv').read_bytes() for out in outs]
     assert tables[0] == tables[1] and len(tables[0].splitlines()) > 10
     assert run['topics']['/image'] == 'image' and run['detector']['image_far_range'] == 55.0
-    call('track', bag, tmp_path / 'none', '--set', 'false_alarm=1e-15')
-    assert main(['track', str(bag), str(tmp_path / 'bad'), '--set', 'false_alrm=1e-9']) == 2
-    assert 'false_al' in capsys.readouterr().err
+    call('track', bag, tmp_path / 'none', '--set', 'sidelobe_db=0.0')
+    assert main(['track', str(bag), str(tmp_path / 'bad'), '--set', 'sidelob_db=1.0']) == 2
+    assert 'sidelob' in capsys.readouterr().err
