@@ -307,7 +307,8 @@ def write_relative(fix: RelativeFix, make: Make) -> Any:
 
 
 def _fix(message: Any, offset: np.ndarray, *, age: float = 0.0, **known: Any) -> RelativeFix:
-    """A fix of which the message says what is `known` besides; age: seconds before its stamp."""
+    """A fix, offset forward, port, up, or with levelled=True east, north, up, of which the message
+    says what is `known` besides; age: seconds before its stamp."""
     return RelativeFix(
         stamp_ns=stamp_ns(message) - nanoseconds(age),
         offset=offset,

@@ -91,6 +91,12 @@ def track_approach(name, **values):
 
 def track_scene(name, seed, overrides=None, **values):
     """A simulated scene and the estimates of it."""
+    return tracked(name, seed, overrides, **values)[:2]
+
+
+def tracked(name, seed, overrides=None, **values):
+    """A simulated scene, the estimates of it by stamp, and the tracker, with parameters `values`
+    beside those that the scene has."""
     scene_config = scenario(name, overrides)
     scene = simulate(scene_config, seed)
     config = ObstacleConfig(
@@ -102,7 +108,8 @@ def track_scene(name, seed, overrides=None, **values):
             **values,
         }
     )
-    return scene, run(ObstacleTracker(config), [item.measurement for item in scene.measurements])
+    tracker = ObstacleTracker(config)
+    return scene, run(tracker, [item.measurement for item in scene.measurements]), tracker
 
 
 def followed(estimate, truth, ping, near=5.0):

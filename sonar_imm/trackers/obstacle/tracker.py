@@ -426,7 +426,8 @@ class ObstacleTracker:
         )
 
     def _watch(self, known: Known, ping: Ping) -> Known:
-        """Count what users are warned of."""
+        """Count what users are warned of, in all pings so far: `warnings` are read at the end.
+        Tracks that have just ended are in `ping` only (`ping.stays`)."""
         nis = known.obstacles.nis
         sure = np.isfinite(nis) & known.confirmed
         alike = moving_alike(self.filter, known.obstacles.mixture, known.confirmed)

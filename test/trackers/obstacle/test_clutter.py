@@ -11,7 +11,7 @@
 from pathlib import Path
 
 from attrs import evolve
-from helpers.obstacle_runs import followed, run, SECOND
+from helpers.obstacle_runs import followed, SECOND, tracked
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -41,8 +41,7 @@ from sonar_imm.trackers.obstacle.ground import GroundMap
 from sonar_imm.trackers.obstacle.mixtures import Beam, PARTS, visible
 from sonar_imm.trackers.obstacle.pings import Echoes, Ping
 from sonar_imm.trackers.obstacle.scales import Scales
-from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
-from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig
 
 VECTORS = Path(__file__).parents[2] / 'vectors' / 'obstacle_in_clutter'
 CONFIG = ObstacleConfig()
@@ -304,15 +303,10 @@ def test_echoes_that_err_alike_are_not_narrowed():
 # -- the tracker -------------------------------------------------------------------------------
 
 
-def seen(seed, **overrides):
-    """A scene of an approach, its estimates by stamp, and the tracker."""
-    scene = simulate(scenario('approach', {'sonar_lever': LEVER, **overrides}), seed)
-    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=LEVER))
-    return scene, run(tracker, [item.measurement for item in scene.measurements]), tracker
-
-
 def test_an_obstacle_among_thirty_false_echoes_is_the_only_one():
-    scene, final, tracker = seen(3, clutter=30.0, last_range=50.0)
+    scene, final, tracker = tracked(
+        'approach', 3, {'sonar_lever': LEVER, 'clutter': 30.0, 'last_range': 50.0}
+    )
     truth, confirmed = scene.truth[0], [e.extras['track_state'] > 0 for e in final.values()]
     assert sum(int(each.sum()) for each in confirmed[10:]) == len(confirmed[10:])
     for ping in range(10, len(truth.stamp_ns)):
@@ -324,7 +318,9 @@ def test_an_obstacle_among_thirty_false_echoes_is_the_only_one():
 
 
 def test_an_obstacle_that_is_seldom_seen_is_confirmed_and_said_to_be():
-    scene, final, tracker = seen(1, detection_probability=0.2, last_range=40.0)
+    scene, final, tracker = tracked(
+        'approach', 1, {'sonar_lever': LEVER, 'detection_probability': 0.2, 'last_range': 40.0}
+    )
     truth = scene.truth[0]
     ping = len(truth.stamp_ns) - 1
     row = followed(final[int(truth.stamp_ns[ping])], truth, ping)
