@@ -12,8 +12,8 @@
 
 A flat floor 15 m below an array of eight staves, with a white rough patch of 0.5 m; 30 to 10 dB.
 Prints RMSE of the height over smooth floor, patch and all, RMSE of the angle, intersection over
-union of the patch with the bins labelled rough, the share of true heights within two standard
-deviations, and, in brackets, what an independent prototype found before.
+union of the patch with the bins labelled rough, and the share of true heights within two standard
+deviations.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.bathymetry_paper import PRINTED, PrintedTracker, WALKS
-from benchmarks.study import cell, Parts, Row, study, truths
+from benchmarks.study import Parts, study, truths
 from sonar_imm.acoustics import array, spatial
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm.truth import Scene, TrueProfile
@@ -36,59 +36,20 @@ SLOPES_ONLY: dict[str, Any] = {
     'transition_matrix': (1.0, 0.0, 0.0, 1.0),
     'initial_probabilities': (0.0, 1.0),
 }
-KEYS = ('smooth', 'patch', 'all', 'angle_deg', 'iou')
 SLOPE_SET: dict[str, Any] = {'model_set': 'height_rw_ncs', 'sigmas': (1.0, 1.0)}
-TWO: dict[str, Any] = {'sigmas': (0.01, 1.0)}
-QUICK: dict[str, Any] = {'sigmas': (0.01, 0.7)}
-GRID: dict[str, Any] = {'engine': 'grid'}
-
-# Name: parameters that differ from `COMMON`, and smooth, patch, all (m), angle (deg), overlap as
-# found before by an independent prototype; None where it was not measured.
 COMMON: dict[str, Any] = {**WALKS, 'gate_false_alarm': 1.0, 'initial_std': 1.0}
-GATED: dict[str, Any] = {'gate_false_alarm': 1e-3, 'initial_std': 0.0}
-TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
-    'random walk only': (
-        {**TWO, 'transition_matrix': (1.0, 0.0, 0.0, 1.0), 'initial_probabilities': (0.0, 1.0)},
-        (0.401, 0.331, 0.391, 0.41, None),
-    ),
-    'constant slope only': ({**SLOPE_SET, **SLOPES_ONLY}, (0.119, 0.499, 0.231, 0.30, None)),
-    'height_rw_ncs, paper': (
-        {**PRINTED, **SLOPE_SET, 'transition_matrix': PAPER_CHAIN},
-        (0.106, 0.328, 0.165, 0.20, 0.72),
-    ),
-    'height_rw_ncs, corrected': (
-        {**SLOPE_SET, 'transition_matrix': PAPER_CHAIN},
-        (0.153, 0.327, 0.194, 0.22, 0.72),
-    ),
-    'height_two_rw': (
-        {**TWO, 'transition_matrix': PAPER_CHAIN},
-        (0.110, 0.327, 0.167, 0.20, 0.72),
-    ),
-    'height_two_rw, exact grid': (
-        {**TWO, **GRID, 'transition_matrix': PAPER_CHAIN},
-        (0.110, 0.325, 0.166, 0.20, 0.73),
-    ),
-    'height_two_rw, stay .995': (TWO, (0.070, 0.334, 0.151, None, 0.79)),
-    'the same, modes smoothed': ({**TWO, 'smoothing': 'modes'}, (None, None, None, None, 0.83)),
-    'exact forward-backward, stay .995, 0.7 m': (
-        {**QUICK, **GRID, 'smoothing': 'states'},
-        (0.036, 0.302, 0.128, None, 0.90),
-    ),
-    'angle_two_rw': (
-        {'model_set': 'angle_two_rw', 'initial_std': 0.0, 'angle_drift': False},
-        (None,) * 5,
-    ),
-    'height_two_rw, gate': (GATED, (None,) * 5),
-    'defaults': (
-        {'model_set': 'terrain', **GATED},
-        (None,) * 5,
-    ),
+TRACKERS: dict[str, dict[str, Any]] = {
+    'random walk only': {
+        'sigmas': (0.01, 1.0),
+        'transition_matrix': (1.0, 0.0, 0.0, 1.0),
+        'initial_probabilities': (0.0, 1.0),
+    },
+    'constant slope only': {**SLOPE_SET, **SLOPES_ONLY},
+    'height_rw_ncs, paper': {**PRINTED, **SLOPE_SET, 'transition_matrix': PAPER_CHAIN},
+    'defaults': {'model_set': 'terrain', 'gate_false_alarm': 1e-3, 'initial_std': 0.0},
 }
-CLASSICAL: dict[str, tuple[float | None, ...]] = {
-    'phase difference of one pair': (1.71, 0.98, 1.61, 1.51, None),
-    'music': (0.186, 0.527, 0.274, 0.34, None),
-    'capon': (0.258, 0.529, 0.320, 0.37, None),
-}
+"""Name: parameters that differ from `COMMON`."""
+CLASSICAL = ('phase difference of one pair', 'music', 'capon')
 
 
 class Answer(NamedTuple):
@@ -140,7 +101,7 @@ def tracked(values: Mapping[str, Any], scene: Scene, printed: bool) -> Answer:
     return Answer(height, angle, rough, inside)
 
 
-def score(answer: Answer, scene: Scene, prototype: tuple[float | None, ...]) -> dict[str, Any]:
+def score(answer: Answer, scene: Scene) -> dict[str, Any]:
     truth = truths(scene, TrueProfile)
     patch = np.array([profile.patch for profile in truth])
     square = np.square(answer.height - np.array([profile.height for profile in truth]))
@@ -154,7 +115,6 @@ def score(answer: Answer, scene: Scene, prototype: tuple[float | None, ...]) -> 
         'iou': None if rough is None else float((rough & patch).sum() / (rough | patch).sum()),
         'inside_smooth': None if inside is None else float(inside[~patch].mean()),
         'inside_patch': None if inside is None else float(inside[patch].mean()),
-        'prototype': dict(zip(KEYS, prototype)),
     }
 
 
@@ -162,24 +122,12 @@ def main(pings: int = 120, seed: int = 1) -> Parts:
     config = scenario('paper', {'pings': pings})
     scene = simulate(config, seed)
     yield {'pings': pings, 'seed': seed}
-    for name, prototype in CLASSICAL.items():
-        yield {'methods': {name: score(classical(name, scene, config), scene, prototype)}}
-    for name, (values, prototype) in TRACKERS.items():
+    for name in CLASSICAL:
+        yield {'methods': {name: score(classical(name, scene, config), scene)}}
+    for name, values in TRACKERS.items():
         answer = tracked(values, scene, printed=name.endswith(', paper'))
-        yield {'methods': {name: score(answer, scene, prototype)}}
-
-
-def shown(result: Row) -> dict[str, str]:
-    """The errors, and in brackets those of the prototype."""
-    before = result['prototype']
-    cells = {
-        key: cell(result[key]) + ('' if before[key] is None else f' ({before[key]:g})')
-        for key in KEYS
-    }
-    return cells | {
-        'within 2 sd': f'{cell(result["inside_smooth"])} {cell(result["inside_patch"])}'
-    }
+        yield {'methods': {name: score(answer, scene)}}
 
 
 if __name__ == '__main__':
-    study(main, shown=shown)
+    study(main)

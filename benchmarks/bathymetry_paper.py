@@ -12,9 +12,10 @@
 
 The first part runs the tracker as printed (`PrintedTracker` with the parameters `PRINTED`) over
 noises of the rough random walk from .05 to 5 m. The second part is the default tracker on scenes
-whose roughness and fading are not drawn from the laws that it supposes. RMSE of the height (m) on
-smooth floor, in the patch and in all, the share of heights within two standard deviations, and the
-overlap of the patch with the bins labelled rough.
+whose roughness and fading are not drawn from the laws that it supposes, and on difficult ones
+without and with the remedy. RMSE of the height (m) on smooth floor, in the patch and in all, the
+share of heights within two standard deviations, and the overlap of the patch with the bins
+labelled rough.
 """
 
 from __future__ import annotations
@@ -117,6 +118,10 @@ CASES: dict[str, Case] = {
     'echoes with heavier tails': Case('paper', {'law': 'k'}, {}),
     'all three, fractal': Case('foreign', {}, {}),
     'all three, fractal, terrain': Case('foreign', {}, {'model_set': 'terrain'}),
+    'spikes, no gate': Case('spikes', {}, {'gate_false_alarm': 1.0}),
+    'spikes, gate': Case('spikes', {}, {}),
+    'surface echoes, not expected': Case('multipath', {}, {}),
+    'surface echoes, expected': Case('multipath', {}, {'multipath': True}),
 }
 
 

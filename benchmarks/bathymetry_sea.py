@@ -32,9 +32,7 @@ from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 APART: dict[str, Any] = {'ping_rate': 0.3, 'patch_along': []}
 GRID: dict[str, Any] = {'engine': 'grid'}
-ANGLES: dict[str, Any] = {'model_set': 'angle_two_rw'}
 TERRAIN: dict[str, Any] = {'model_set': 'terrain'}
-NADIR: dict[str, Any] = {'first_range': 15.1}
 LOST = 1.0
 """Metres of RMSE from which a ping is lost."""
 
@@ -44,92 +42,27 @@ def unknown(height: float) -> dict[str, Any]:
     return {**APART, 'sonar_height': height, 'first_range': 5.0}
 
 
-EXACT: dict[str, Any] = {**GRID, 'smoothing': 'states', 'sigmas': [0.01, 0.7]}
-LOUD = {'snr_far_db': 30.0}
-EXACT_NAVIGATION = {
-    f'nav_{what}': 0.0
-    for what in ('attitude_error_deg', 'heading_error_deg', 'heave_error', 'position_error')
-}
 STATED: dict[str, Any] = {'sonar_height': 15.0, 'sonar_height_std': 5.0}
+LABELS = {
+    'Gaussian .3 m': ('correlated', {'correlation_length': 0.3}),
+    'Gaussian 1 m': ('correlated', {}),
+    'undulation .5 m in 15 m': ('undulating', {}),
+}
+STAVES = ((0.5, 0.0, 0.0), (3.66, 0.2, 0.0), (3.66, 0.2, 0.2))
+"""Spacing in wavelengths, and what staves differ by and are told to."""
 
 # Name: scenario, what it changes, parameters beside those of the instruments.
 CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     'motion, terrain': ('moving', APART, TERRAIN),
     'motion, grid': ('moving', APART, GRID),
-    'motion, particles': ('moving', APART, {}),
-    'motion, forward-backward': ('moving', APART, {**GRID, 'smoothing': 'states'}),
     'motion, navigation ignored': ('moving', APART, {**GRID, 'navigation': 'ignored'}),
-    'motion, lever and mount ignored': (
-        'moving',
-        APART,
-        {**GRID, 'sonar_lever': [0, 0, 0], 'sonar_mount_rpy_deg': [0, 0, 0]},
-    ),
     'summer profile, terrain': ('moving_profile', APART, TERRAIN),
-    'summer profile, grid': ('moving_profile', APART, GRID),
-    'summer profile, particles': ('moving_profile', APART, {}),
     'summer profile ignored': ('moving_profile', APART, {**GRID, 'sound_speed_profile': []}),
     'height 10 m, told 15, terrain': ('moving', unknown(10.0), {**STATED, **TERRAIN}),
-    'height 10 m, told 15, grid': ('moving', unknown(10.0), {**STATED, **GRID}),
-    'height 10 m, told 15, particles': ('moving', unknown(10.0), STATED),
-    'height 10 m, told 10, grid': (
-        'moving',
-        unknown(10.0),
-        {**GRID, 'sonar_height': 10.0, 'initial_std': 1.0},
-    ),
-    'height 10 m, told 15, grid, exact navigation': (
-        'moving',
-        {**unknown(10.0), **EXACT_NAVIGATION},
-        {**STATED, **GRID},
-    ),
-    'height 20 m, told 15, grid, exact navigation': (
-        'moving',
-        {**unknown(20.0), **EXACT_NAVIGATION},
-        {**STATED, **GRID},
-    ),
-    'height 15 m, told 10, grid, exact navigation': (
-        'moving',
-        {**unknown(15.0), **EXACT_NAVIGATION},
-        {**STATED, **GRID, 'sonar_height': 10.0},
-    ),
-    'height 15 m, told 15, grid, exact navigation': (
-        'moving',
-        {**unknown(15.0), **EXACT_NAVIGATION},
-        {**STATED, **GRID},
-    ),
-    'height 20 m, told 15, terrain': ('moving', unknown(20.0), {**STATED, **TERRAIN}),
-    'height 20 m, told 15, grid': ('moving', unknown(20.0), {**STATED, **GRID}),
-    'height 20 m, told 15, particles': ('moving', unknown(20.0), STATED),
-    'nadir, angles, drift, grid': ('paper', NADIR, {**ANGLES, **GRID}),
-    'nadir, angles, drift, particles': ('paper', NADIR, ANGLES),
-    'nadir, angles, paper, grid': ('paper', NADIR, {**ANGLES, **GRID, 'angle_drift': False}),
-    'nadir, angles, paper, particles': ('paper', NADIR, {**ANGLES, 'angle_drift': False}),
-    'nadir, angles, .03 deg, drift, grid': (
-        'paper',
-        NADIR,
-        {**ANGLES, **GRID, 'sigmas_deg': [0.03, 0.1, 2.0]},
-    ),
-    'nadir, terrain': ('paper', NADIR, TERRAIN),
-    'nadir, heights': ('paper', NADIR, GRID),
-    'labels, white, two walks': ('paper', {}, GRID),
-    'labels, white, terrain': ('paper', {}, TERRAIN),
-    'labels, Gaussian .3 m, two walks': ('correlated', {'correlation_length': 0.3}, GRID),
-    'labels, Gaussian .3 m, terrain': ('correlated', {'correlation_length': 0.3}, TERRAIN),
-    'labels, Gaussian 1 m, two walks': ('correlated', {}, GRID),
-    'labels, Gaussian 1 m, terrain': ('correlated', {}, TERRAIN),
-    'labels, undulation .5 m in 15 m, terrain': ('undulating', {}, TERRAIN),
-    'labels, undulation .2 m in 20 m, terrain': (
-        'undulating',
-        {'undulation_height': 0.2, 'undulation_length': 20.0},
-        TERRAIN,
-    ),
-    'labels, slope .1, terrain': ('slope', {}, TERRAIN),
-    'labels, slope .05, terrain': ('slope', {'slope': 0.05}, TERRAIN),
-    'labels, slope .07, terrain': ('slope', {'slope': 0.07}, TERRAIN),
-    'labels, slope .1, terrain, 30 dB everywhere': ('slope', LOUD, TERRAIN),
-    'labels, undulation .5 m in 15 m, terrain, 30 dB everywhere': ('undulating', LOUD, TERRAIN),
+    'nadir, terrain': ('paper', {'first_range': 15.1}, TERRAIN),
     **{
-        f'coupling {strength:g}': ('moving', {}, {**EXACT, 'ping_coupling': strength})
-        for strength in (0.0, 0.15, 0.35, 0.7)
+        f'labels, {name}, terrain': (scene, changes, TERRAIN)
+        for name, (scene, changes) in LABELS.items()
     },
     **{
         f'coupling {strength:g}, terrain': ('moving', {}, {**TERRAIN, 'ping_coupling': strength})
@@ -141,8 +74,7 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
             {'staves': 2, 'spacing_wavelengths': spacing, 'decorrelation': share},
             {**GRID, 'decorrelation': stated},
         )
-        for spacing in (0.5, 3.66)
-        for share, stated in ((0.0, 0.0), (0.05, 0.0), (0.05, 0.05), (0.2, 0.0), (0.2, 0.2))
+        for spacing, share, stated in STAVES
     },
 }
 

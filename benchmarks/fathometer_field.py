@@ -32,6 +32,16 @@ reflectors above 4 sigma, and of all, were said to be, and how often it was so.
 halves: of the lines of real data, if SONAR_IMM_DATA names them, even and odd traces: share of the
 records whose floors differ by more than 0.75 m, and what is said where they do and do not.
 
+profilers: the same lines, converted and tracked by the command as docs/fathometer.md says, with
+the water found and off. The floor is picked without a tracker: the first of three successive
+samples above an eighth of what loud traces reach (`edge`), and the greatest of the four from there
+on (`followed`); a record is followed when a reflector lies within 1 m of that. at_twice_the_floor:
+reflectors within 1 m of that, of which so many are marked as multiples. Where lines cross, their
+horizons are compared; L3 and L9 cross where the floor is at 4 m, above the first sample that is
+taken (4.5 m), so that this crossing is made once more from the end of the transmit pulse on (3.4
+m). depth_std and the form of the likelihood were chosen on L2 and L9; the rule by which the first
+return keeps its name, and the chain of the water, were made with all four in view.
+
 cost: CPU ms a record of 20,000 particles, of the first scene of moving (800 cells), without jumps
 and with; and of `correct_phones` for 16 hydrophones and 541 frequencies.
 """
@@ -42,6 +52,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 import os
 from pathlib import Path
+import tempfile
 import time
 from typing import Any
 
@@ -52,11 +63,14 @@ from sonar_imm.acoustics.ambient import sample_csdm, surface_noise_csdm
 from sonar_imm.acoustics.hydrophones import correct_phones
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimates import Estimate
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import CrossSpectra, Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm.trackers.fathometer.water import Water
+from sonar_imm_tools.cli import main as command
+from sonar_imm_tools.evaluation.fathometer.crossing import crossing_metrics, summary
+from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.recordings.segy_lines import read_segy
 
 STEP, SAMPLES, RECORDS, PULSE, NOISE = 0.05, 400, 120, 0.15, 0.02
@@ -207,6 +221,92 @@ def halves(path: Path, spacing: float) -> dict[str, float]:
 def real_lines() -> list[Path]:
     folder = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data')) / 'sbp_chiapas'
     return sorted(folder.glob('*.seg'))
+
+
+# -- profiler lines -------------------------------------------------------------------------------
+
+FIRST, PICKED, STACK, NEAR = 12, 74, 4, 1.0
+UNCUT = 9
+"""The first sample after the transmit pulse."""
+FEW = ('--set', 'particles=5000')
+ROWS: dict[str, tuple[str, ...]] = {'default': (), 'water off': ('--set', 'water=off')}
+_RUN, _REACH, _LOUD = 3, 4, 8.0
+
+
+def profilers(folder: Path) -> Parts:
+    """Every line under every row, and the crossings of the default row."""
+    paths = {path.stem.split('_SBP_')[1][:2]: path for path in real_lines()}
+    for line, path in paths.items():
+        convert(path, folder / f'{line}.bag', FIRST)
+        for row, extra in ROWS.items():
+            out = folder / (line if not extra else 'other')
+            call('track', folder / f'{line}.bag', out, '--overwrite', *FEW, *extra)
+            yield {'lines': {line: {row: followed(path, RunFolder(out))}}}
+    for line in ('L3', 'L9'):
+        convert(paths[line], folder / f'{line}_uncut.bag', UNCUT)
+        call('track', folder / f'{line}_uncut.bag', folder / f'{line}_uncut', *FEW)
+    crossings = {}
+    for a, b, cut in (('L1', 'L9', ''), ('L2', 'L9', ''), ('L3', 'L9', ''), ('L3', 'L9', 'uncut')):
+        first, other = (RunFolder(folder / (f'{c}_{cut}' if cut else c)) for c in (a, b))
+        name = f'{a} x {b}, {cut}' if cut else f'{a} x {b}'
+        crossings[name] = crossing_metrics(first, other, 3.0)
+    horizons = [h for c in crossings.values() for at in c['crossings'] for h in at['horizons']]
+    between = summary([h for h in horizons if h['judged']])
+    yield {'crossings': crossings, 'between_lines': between}
+
+
+def convert(path: Path, bag: Path, first: int) -> None:
+    call(
+        *('convert', 'segy', path, bag, '--sample-spacing', SPACING),
+        *('--first-sample', first, '--samples', FIRST + PICKED - first, '--stack', STACK),
+    )
+
+
+def call(*arguments: Any) -> None:
+    if command([str(argument) for argument in arguments]):
+        raise SystemExit('the command failed')
+
+
+def followed(path: Path, run: RunFolder) -> dict[str, float]:
+    """How a tracked line goes with what is picked without a tracker."""
+    raw = read_segy(path).amplitude
+    count = len(raw) // STACK
+    amplitude = raw[: STACK * count].reshape(count, STACK, -1).mean(axis=1)
+    edges, peaks = picked(amplitude[:, FIRST : FIRST + PICKED])
+    rows, ids, double = [], set(), []
+    for estimate, edge, peak in zip(run.read_estimates(), edges, peaks):
+        columns = estimate.columns()
+        depth, bottom = columns['depth'], int(np.argmax(columns['is_bottom']))
+        away = np.abs(np.nan_to_num(depth, nan=1e9) - SPACING * (FIRST + peak))
+        if away.min() < NEAR:
+            ids.add(int(columns['track_id'][np.argmin(away)]))
+        at_edge = (np.abs(depth - SPACING * (FIRST + edge)) < NEAR).any()
+        there = np.isfinite(depth)
+        rows.append((away.min() < NEAR, away[bottom] < NEAR, at_edge, there.sum()))
+        twice = np.abs(depth[there] - 2.0 * depth[bottom]) < NEAR
+        double += list(columns['multiple_probability'][there][twice] > 0.5)
+    at_peak, by_bottom, at_edges, number = np.mean(np.array(rows, np.float64), axis=0).tolist()
+    return {
+        'records': count,
+        'followed': at_peak,
+        'followed_by_is_bottom': by_bottom,
+        'followed_edge': at_edges,
+        'ids_per_100': 100.0 * len(ids) / count,
+        'reflectors': number,
+        'at_twice_the_floor': len(double),
+        'of_these_marked': int(np.sum(double)),
+    }
+
+
+def picked(amplitude: FloatArray) -> tuple[IntArray, IntArray]:
+    """Sample at which each trace (T, n) first begins, and of its first peak; -1 where none is."""
+    loud = float(np.quantile(amplitude.max(axis=1), 0.99)) / _LOUD
+    above = amplitude > loud
+    count = amplitude.shape[1] - _RUN + 1
+    run = np.logical_and.reduce([above[:, k : k + count] for k in range(_RUN)])
+    edges = np.where(run.any(axis=1), run.argmax(axis=1), -1)
+    reach = [int(np.argmax(trace[i : i + _REACH])) for i, trace in zip(edges, amplitude)]
+    return edges, np.where(edges < 0, -1, edges + reach)
 
 
 # -- layers below an array ------------------------------------------------------------------------
@@ -444,7 +544,7 @@ def rows_of(case: str) -> dict[str, Callable[[int, int], dict[str, float]]]:
     return {case: counted if case == 'counted' else cost}
 
 
-CASES = ('cost', 'moving', 'counted', 'phones', 'lines')
+CASES = ('cost', 'moving', 'counted', 'phones', 'lines', 'halves', 'profilers')
 
 
 def main(
@@ -456,9 +556,14 @@ def main(
 ) -> Parts:
     """first: the first seed."""
     yield known(out)
-    for path in real_lines():
+    for path in real_lines() if 'halves' in cases else ():
         yield {'halves': {path.stem.split('_SBP_')[1][:5]: halves(path, SPACING)}}
+    if 'profilers' in cases and real_lines():
+        with tempfile.TemporaryDirectory() as folder:
+            yield from profilers(Path(folder))
     for case in cases:
+        if case in ('halves', 'profilers'):
+            continue
         for name, row in rows_of(case).items():
             found = []
             for seed in range(first, first + runs):

@@ -6,44 +6,57 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What records that are missing cost the fathometer tracker.
+"""What missing records, layers that dip, a wrong speed of sound and multiples cost the fathometer.
 
     python -m benchmarks.fathometer_gaps --out docs/results/fathometer_gaps.json
 
-Traces of six layers of 7 to 34 sigma that walk by `walk` from record to record, with the pulse of
-50 to 4000 Hz: 20 records, then none for `gap` records, in which the layers go on walking, then 10
-more. The tracker has its defaults (depth_std 0.1 m). P in the first, the second and the later
-records after the gap; depth errors (rms) and the share of them within two stated standard
-deviations in the first record and in the others; identities: the share of the layers that have the
-name after the gap, in its first record and three records later, that they had before. 'once' is
-what a tracker does that takes a gap for a record (record_interval longer than any gap).
+Traces of six layers of 7 to 34 sigma that walk by .1 or .15 m from record to record, or of eight
+that are deeper by so many m in each as well ('dip'), with the pulse of 50 to 4000 Hz: 20 records,
+then none for some, in which the layers go on, then 10 more. The tracker has its defaults
+(depth_std 0.1 m). 'without slopes': slope_std 0; 'gap not seen': a record_interval longer than
+any gap; 'Kalman': one filter for each layer with the same depth_std, which knows which echo is of
+which layer: the highest point of the record within 0.25 m of where that is. 'sound': the speed is
+off by so many m/s, or drawn with the standard deviation of 10 m/s that is the default.
 
-The Kalman filters know which echo is of which layer: one for each, with the same depth_std. What
-they are given is the highest point of the record within 0.25 m of where the layer is.
+P: share of the records whose number of layers is right, before the gap, in the first record after
+it, in the later ones and in all; inside: depths within two stated standard deviations; kept: share
+of the layers that have the ID in the fourth record after the gap that they had before it; named:
+IDs given in a run; dipping: the mean probability of it.
+
+`multiples`: tracks are drawn, not filtered. Four primaries, the first 8 to 14 m below the surface,
+the others 2 to 8 m below each other, found with errors of 0.03 m beside one of 0.03 m of the
+array's depth that all share, and of all surface multiples and peg-legs that lie between the
+deepest primary and 45 m two, drawn at random. The floor is flat, or each layer walks by 0.05 m a
+record. 'no sign': polarity positive. 'sign': positive primaries, multiples with the sign they
+have. Told after so many records: how many of the multiples ('found') and of the primaries
+('falsely') have a probability of more than a half.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.study import Parts, rms, study
+from benchmarks.study import mean_of, Parts, rms, study
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Trace
+from sonar_imm.trackers.fathometer.multiples import Multiples, Seen, ways_above
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 LAYERS = np.array([46.0, 52.3, 58.1, 65.4, 71.2, 78.9])
 SIGMAS = np.array([34.0, 25.0, 18.0, 12.0, 9.0, 7.0])
 STEP, BEFORE, AFTER, SECONDS = 1.0 / 64.0, 20, 10, 10.0
 DEPTH = 38.0 + STEP * np.arange(3072)
-ARRAY_STD = 0.0
-CASES = (0.1, 0.15)
-ONCE = {'record_interval': 86400.0, 'slope_std': 0.0}
-GAPS = (0, 10, 30, 120)
+DIPPING = np.array([46.0, 51.3, 55.1, 59.4, 64.2, 68.9, 73.0, 78.2])
+DIPPING_SIGMAS = np.array([34.0, 28.0, 22.0, 17.0, 13.0, 11.0, 9.0, 7.0])
+DIPPING_DEPTH = 40.0 + STEP * np.arange(4608)
+ARRAY, SPEED = 30.0, 1500.0
+"""Depth of the array of the traces, m; speed that trackers assume, m/s."""
 
 
 def scene(
@@ -74,10 +87,21 @@ def scene(
                 depth=depth,
                 amplitude=noise[: len(depth)] / noise.std() + echoes,
                 sigma=np.ones(len(depth)),
-                reference_depth=30.0,
+                reference_depth=ARRAY,
             )
         )
     return traces, every[there]
+
+
+def dipping(kind: str, dip: float, gap: int, seed: int) -> tuple[list[Trace], FloatArray]:
+    """Traces of eight layers, and their true depths (records, 8). kind: 'parallel': all dip alike;
+    'fan': by half to one and a half times `dip`; 'turn': down for 15 records, then up."""
+    slope: float | FloatArray = dip
+    if kind == 'fan':
+        slope = dip * np.linspace(0.5, 1.5, len(DIPPING))
+    if kind == 'turn':
+        slope = np.where(np.arange(BEFORE + gap + AFTER) < 15, dip, -dip)[:, None]
+    return scene(gap, 0.1, seed, slope, DIPPING_DEPTH, DIPPING, DIPPING_SIGMAS)
 
 
 def highest(trace: Trace, depth: float) -> float:
@@ -110,9 +134,7 @@ def kalman(traces: Sequence[Trace], truth: FloatArray, gap: int) -> FloatArray:
 def tracked(traces: Sequence[Trace], truth: FloatArray, **parameters: Any) -> dict[str, Any]:
     """right (records,), errors and stated standard deviations of layers that were found
     (records, 6, 2), ids (records, 6), 0 where a layer was not found."""
-    config = FathometerConfig(
-        **{'array_depth_std': ARRAY_STD, 'sound_speed_std': 0.0, **parameters}
-    )
+    config = FathometerConfig(**{'array_depth_std': 0.0, 'sound_speed_std': 0.0, **parameters})
     tracker = FathometerTracker(config)
     right = np.zeros(len(traces), bool)
     found, ids = np.full((*truth.shape, 2), np.nan), np.zeros(truth.shape, int)
@@ -147,44 +169,175 @@ def inside(errors: FloatArray) -> float:
 
 
 def summary(runs: Sequence[dict[str, Any]]) -> dict[str, float]:
-    right = np.array([run['right'] for run in runs])[:, BEFORE:]
-    found = np.array([run['found'] for run in runs])[:, BEFORE:]
+    right = np.array([run['right'] for run in runs])
+    found = np.array([run['found'] for run in runs])
     ids = np.array([run['ids'] for run in runs])
     before = ids[:, BEFORE - 1 : BEFORE]
-    same = (ids[:, BEFORE:] == before) & (before > 0)
-    known = before[:, 0] > 0
+    same, known = (ids[:, BEFORE:] == before) & (before > 0), before[:, 0] > 0
+    after, errors = found[:, BEFORE:], found[:, BEFORE, :, 0]
     return {
-        'P, 1st': float(right[:, 0].mean()),
-        'P, 2nd': float(right[:, 1].mean()),
-        'P, later': float(right[:, 2:].mean()),
-        'found, 1st': float(np.isfinite(found[:, 0, :, 0]).mean()),
-        'error, 1st, m': rms(found[:, 0, :, 0][np.isfinite(found[:, 0, :, 0])]),
-        'inside, 1st': inside(found[:, 0]),
-        'inside, later': inside(found[:, 1:]),
-        'identities, 1st': float(same[:, 0][known].mean()),
-        'identities, 4th': float(same[:, 3][known].mean()),
+        'P': float(right.mean()),
+        'P, before': float(right[:, :BEFORE].mean()),
+        'P, 1st': float(right[:, BEFORE].mean()),
+        'P, 2nd': float(right[:, BEFORE + 1].mean()),
+        'P, later': float(right[:, BEFORE + 2 :].mean()),
+        'found, 1st': float(np.isfinite(errors).mean()),
+        'error, 1st, m': rms(errors[np.isfinite(errors)]),
+        'inside': inside(found),
+        'inside, before': inside(found[:, :BEFORE]),
+        'inside, after': inside(after),
+        'inside, 1st': inside(after[:, 0]),
+        'inside, later': inside(after[:, 1:]),
+        'kept, 4th': float(same[:, 3][known].mean()) if known.any() else 0.0,
+        **{
+            name: float(np.mean([run[name] for run in runs]))
+            for name in ('named', 'dipping')
+            if name in runs[0]
+        },
     }
 
 
+Rows = dict[str, dict[str, float]]
+
+
+def after_gap(seed: int, particles: int, walk: float, gap: int, name: str) -> Rows:
+    """Rows of the tracker, of one that takes the gap for a record, and of the Kalman filters."""
+    traces, truth = scene(gap, walk, seed)
+    known = np.ones(truth.shape, int)
+    unseen = {'record_interval': 86400.0, 'slope_std': 0.0}
+    return {
+        name: summary([tracked(traces, truth, particles=particles)]),
+        f'{name}, gap not seen': summary([tracked(traces, truth, particles=particles, **unseen)]),
+        f'{name}, Kalman': summary(
+            [{'right': known[:, 0], 'found': kalman(traces, truth, gap), 'ids': known}]
+        ),
+    }
+
+
+def along_dips(
+    seed: int, particles: int, dip: float, gap: int, name: str, **parameters: float
+) -> Rows:
+    traces, truth = dipping('parallel', dip, gap, seed)
+    return {name: summary([tracked(traces, truth, particles=particles, **parameters)])}
+
+
+def speeds(seed: int, particles: int) -> Rows:
+    """The speed only scales what is seen, so that one run serves all speeds."""
+    traces, truth = scene(0, 0.1, seed)
+    found = tracked(traces, truth, particles=particles, sound_speed_std=10.0)
+    drawn = 10.0 * np.random.default_rng([seed, 2]).standard_normal(400)
+    return {
+        name: {'P': float(np.mean(found['right'])), 'inside': within(found['found'], truth, off)}
+        for name, off in (
+            ('sound 5 m/s faster', np.array([5.0])),
+            ('sound 10 m/s faster', np.array([10.0])),
+            ('sound drawn', drawn),
+        )
+    }
+
+
+def within(found: FloatArray, truth: FloatArray, faster: FloatArray) -> float:
+    """Share of errors and stated deviations (T, K, 2) within two of these, if the sound were so
+    many m/s faster (R,) than is assumed and the layers (T, K) as much deeper."""
+    error = found[..., 0] - faster[:, None, None] / SPEED * (truth - ARRAY)
+    seen = np.isfinite(found[..., 0])
+    return float(np.mean(np.abs(error[:, seen]) <= 2.0 * found[seen][:, 1]))
+
+
+CASES: dict[str, Callable[..., Rows]] = {
+    **{
+        name: partial(after_gap, walk=walk, gap=30, name=name)
+        for walk in (0.1, 0.15)
+        for name in [f'30 missing, walk {walk:g} m']
+    },
+    **{
+        name: partial(along_dips, dip=dip, gap=gap, name=name)
+        for dip, gap in ((0.4, 0), (0.4, 30), (0.0, 120), (0.1, 120))
+        for name in [f'dip {dip:g} m, {gap} missing']
+    },
+    'still': partial(along_dips, dip=0.4, gap=0, name='dip 0.4 m, without slopes', slope_std=0.0),
+    'speed': speeds,
+}
+
+# -- multiples ------------------------------------------------------------------------------------
+
+PRIMARIES, DEEPEST, ERROR, RECORDS = 4, 45.0, 0.03, (1, 5, 20, 60)
+FLOORS = {'flat floor': 0.0, 'walk .05 m': 0.05}
+"""Name: how far a layer walks from record to record, m."""
+
+
+def drawn(rng: np.random.Generator, walk: float) -> tuple[np.ndarray, np.ndarray]:
+    """Depths (T, K) as they are found and sign (K,) of the amplitudes; multiples come last."""
+    while True:
+        first = np.cumsum(np.append(rng.uniform(8.0, 14.0), rng.uniform(2.0, 8.0, PRIMARIES - 1)))
+        ways = ways_above(np.ones(PRIMARIES), PRIMARIES)
+        ends = (first[ways.member] * ways.factor).sum(axis=1)
+        free = np.flatnonzero((ends > first[-1] + 1.0) & (ends < DEEPEST))
+        if len(free) < 2:
+            continue
+        which = rng.choice(free, 2, replace=False)
+        if abs(np.diff(ends[which])[0]) > 1.0:
+            break
+    steps = walk * rng.standard_normal((max(RECORDS), PRIMARIES))
+    z = first + np.cumsum(steps, axis=0)
+    multiple = (z[:, ways.member[which]] * ways.factor[which]).sum(axis=2)
+    found = np.column_stack([z, multiple])
+    # Depths are those of the array plus what is heard; a peg-leg is as wrong as a primary.
+    found += ERROR * rng.standard_normal((len(found), 1))
+    return found + ERROR * rng.standard_normal(found.shape), np.append(
+        np.ones(PRIMARIES), ways.sign[which]
+    )
+
+
+def multiples_marked(
+    rng: np.random.Generator, walk: float, polarity: str
+) -> dict[int, np.ndarray]:
+    """Which reflectors are marked (K,) after so many records, primaries first."""
+    config = FathometerConfig(polarity=polarity, depth_std=max(walk, 0.02))
+    found, sign = drawn(rng, walk)
+    if polarity == 'positive':
+        sign = np.ones(len(sign))
+    marked, kept = Multiples(), {}
+    for k, depth in enumerate(found, start=1):
+        order = np.argsort(depth)
+        ids = (1 + order).astype(np.uint32)
+        variance = np.full(len(depth), ERROR**2)
+        seen = Seen(ids, depth[order], variance, sign[order], ERROR**2)
+        if k in RECORDS:
+            probability = np.empty(len(depth))
+            probability[order] = marked.probabilities(seen, config, DEEPEST)
+            kept[k] = probability > 0.5
+        marked = marked.after(seen)
+    return kept
+
+
+def multiples(runs: int) -> Parts:
+    for name, walk in FLOORS.items():
+        for label, polarity in (('no sign', 'positive'), ('sign', 'both')):
+            rng = np.random.default_rng(1)
+            found = [multiples_marked(rng, walk, polarity) for _ in range(runs)]
+            row: dict[str, float] = {'runs': float(runs)}
+            for k in RECORDS:
+                marked = np.array([each[k] for each in found])
+                row[f'{k}: found'] = float(marked[:, PRIMARIES:].mean())
+                row[f'{k}: falsely'] = float(marked[:, :PRIMARIES].mean())
+            yield {'multiples': {f'{name}, {label}': row}}
+
+
 def main(
-    runs: int = 20, particles: int = 20_000, walks: Sequence[float] = CASES, gaps: tuple = GAPS
+    runs: int = 20, particles: int = 5000, drawn: int = 400, cases: Sequence[str] = tuple(CASES)
 ) -> Parts:
+    """drawn: runs of the tracks with multiples."""
     yield {'runs': runs, 'particles': particles}
-    for walk in walks:
-        for gap in gaps:
-            ways: dict[str, list[dict[str, Any]]] = {'tracker': [], 'once': [], 'Kalman': []}
-            for seed in range(runs):
-                traces, truth = scene(gap, walk, seed)
-                ways['tracker'].append(tracked(traces, truth, particles=particles))
-                if gap:
-                    ways['once'].append(tracked(traces, truth, particles=particles, **ONCE))
-                known = np.ones(truth.shape, int)
-                bound = {'right': known[:, 0], 'found': kalman(traces, truth, gap), 'ids': known}
-                ways['Kalman'].append(bound)
-            for name, made in ways.items():
-                if made:
-                    yield {'table': {f'walk {walk:g} m, gap {gap}, {name}': summary(made)}}
+    for case in cases:
+        rows: dict[str, list[Mapping[str, float]]] = {}
+        for seed in range(runs):
+            for name, row in CASES[case](seed, particles).items():
+                rows.setdefault(name, []).append(row)
+        for name, each in rows.items():
+            yield {'table': {name: {'runs': len(each)} | mean_of(each)}}
+    yield from multiples(drawn)
 
 
 if __name__ == '__main__':
-    study(main)
+    study(main, cases={'choices': list(CASES)})

@@ -20,30 +20,41 @@ sound speed, fish and false echoes: errors of the corrections, and as multiples 
 standard deviations. `grid`: the charts of it in 1 m cells over the middle, about the median of
 their errors, since no crossing tells the level: `level_inside` is the share within two stated
 deviations less that of the level (`Adjustment.levels`), `inside` with the level. `walls`: the
-sides of the wreck, 40 x 8 x 4 m, in 1 m cells with the true corrections, as the grid is and with
-other choices.
+sides of the wreck, 40 x 8 x 4 m, in 1 m cells with the true corrections.
+
+`cost`: of `sonar-imm survey --adjust` in one process on `lines` lines of 100 m, groups of fifty
+beside each other on a slope, each group the same soundings moved aside, so that lines overlap
+their neighbours throughout: seconds of CPU by stage, and per million soundings; the peak of its
+memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-import contextlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+import resource
+import tempfile
+import time
 
 from attrs import evolve
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 
-from benchmarks.study import mean_of, Parts, rms, study
+from benchmarks.study import in_fresh_process, mean_of, Parts, rms, study
 from sonar_imm.acoustics.sounding import ErrorBudget
 from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm_tools.offline.jobs import workers
 from sonar_imm_tools.recordings.export.points import Points
 from sonar_imm_tools.simulation.survey import budget, Floor, scenario, simulate
-from sonar_imm_tools.survey import grid as grid_module
-from sonar_imm_tools.survey import looks as looks_module
 from sonar_imm_tools.survey.adjustment import adjust
 from sonar_imm_tools.survey.chart import chart_of
 from sonar_imm_tools.survey.grid import grid_of_looks, Soundings
+from sonar_imm_tools.survey.jobs import Options
 from sonar_imm_tools.survey.line import joined_lines, line_of
 from sonar_imm_tools.survey.looks import Looks, looks_of, runs_of
+from sonar_imm_tools.survey.making import make, Progress, sources_of
+from sonar_imm_tools.survey.products import folder_of, write
 
 MIDDLE = (140, 300)
 """First and last column, and row, of the cells that are scored."""
@@ -53,6 +64,8 @@ FLOORS = {
     'slope .1, 1 m': ('slope', 0.1, 1.0),
     'slope .1, 5 m': ('slope', 0.1, 5.0),
 }
+GROUP, SPACING = 50, 40.0
+PARTS = ('one_run', 'walls', 'survey', 'cost')
 WRECK: dict[str, float] = {
     'lines': 4,
     'cross_lines': 2,
@@ -62,21 +75,14 @@ WRECK: dict[str, float] = {
     'fish': False,
 }
 """The wreck lies at .55 of the length and .35 of the width of the parallel lines."""
-WALLS: dict[str, dict[str, float]] = {
-    'as it is': {},
-    'gradients cut at .5': {'STEEPEST': 0.5},
-    'gradients cut at 4': {'STEEPEST': 4.0},
-    'reach of half a cell': {'REACH': 0.5},
-    'cut at gaps of .5 m': {'LEAST_GAP': 0.5},
-    'no errors of navigation': {'nav_errors': 0.0},
-}
 
 
 def main(
     runs: int = 6,
     first: int = 10,
     interval: float = 1.0,
-    parts: Sequence[str] = ('one_run', 'walls', 'survey'),
+    lines: int = 1000,
+    parts: Sequence[str] = PARTS,
 ) -> Parts:
     seeds = range(first, first + runs)
     yield {'runs': runs, 'first_seed': first, 'ping_interval': interval}
@@ -86,8 +92,10 @@ def main(
             f'worst_{way}': min(row[f'inside_{way}'] for row in rows) for way in ('mean', 'looks')
         }
         yield {'one_run': {name: {**mean_of(rows), **worst}}}
-    for name, choices in WALLS.items() if 'walls' in parts else ():
-        yield {'walls': {name: mean_of([walls(seed, **choices) for seed in seeds[:2]])}}
+    if 'walls' in parts:
+        yield {'walls': {'as it is': mean_of([walls(seed) for seed in seeds[:2]])}}
+    if 'cost' in parts:
+        yield {'cost': in_fresh_process(cost, lines)}
     adjusted: list[dict[str, float]] = []
     charts: dict[str, list[dict[str, float]]] = {}
     for seed in seeds if 'survey' in parts else ():
@@ -196,21 +204,16 @@ def about_level(
     }
 
 
-def walls(seed: int, nav_errors: float = 1.0, **choices: float) -> dict[str, float]:
+def walls(seed: int) -> dict[str, float]:
     """Errors about their median on the sides of the wreck and on all nodes beside it."""
-    scene = simulate(scenario('survey', {**WRECK, 'nav_errors': nav_errors}), seed)
+    scene = simulate(scenario('survey', WRECK), seed)
     parts = [
         line_of(points, budget()).corrected(c)
         for points, c in zip(scene.points, scene.corrections)
     ]
     number = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
     own = evolve(budget(), sound_speed=0.0)
-    where = looks_module if 'STEEPEST' in choices else grid_module
-    with contextlib.ExitStack() as stack:
-        for name, value in choices.items():
-            stack.callback(setattr, where, name, getattr(where, name))
-            setattr(where, name, value)
-        nodes = grid_of_looks(Soundings(joined_lines(parts), number), 1.0, (20, 0, 120, 120), own)
+    nodes = grid_of_looks(Soundings(joined_lines(parts), number), 1.0, (20, 0, 120, 120), own)
     x, y = np.asarray(np.column_stack([nodes.ix, nodes.iy]) + 0.5, np.float64).T
     error = nodes.z - scene.floor.at(x, y)
     off = np.abs(error - np.median(error))
@@ -223,6 +226,60 @@ def walls(seed: int, nav_errors: float = 1.0, **choices: float) -> dict[str, flo
         'inside': float(np.mean(off[side] < 2.0 * nodes.sd[side])),
         'others_rms': rms(off[~side & (out > 0.8)]),
     }
+
+
+def cost(lines: int) -> dict[str, float]:
+    """CPU seconds of the stages, and the peak of the memory of this process, MB."""
+    with tempfile.TemporaryDirectory() as folder:
+        runs = Path(folder) / 'lines'
+        soundings = write_lines(runs, lines)
+        found: dict[str, float] = {'lines': lines, 'soundings': soundings}
+        stage, begun = '', 0.0
+
+        def begin(what: str, total: int) -> Callable[[int], None]:
+            nonlocal stage, begun
+            now = time.process_time()
+            if stage:
+                name = f'{stage}, s'
+                found[name] = found.get(name, 0.0) + now - begun
+            stage, begun = what, now
+
+            def advance(count: int) -> None:
+                nonlocal total
+                total -= count
+                if what == 'statistics' and total == 0:
+                    begin('adjustment', 0)  # what the command does between two rounds
+
+            return advance
+
+        progress = Progress(begin=begin, say=lambda text: None, warn=lambda text: None)
+        options = Options(adjusted=True)
+        with folder_of(Path(folder) / 'chart', options, runs) as place, workers(1) as run:
+            made = make(sources_of(runs), place, options, run, progress)
+            begin('products', 0)
+            write(made, place)
+            begin('', 0)
+    per_million = {
+        f'{name} per million': value / soundings * 1e6
+        for name, value in found.items()
+        if name.endswith(', s')
+    }
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    return {**found, **per_million, 'peak, MB': peak}
+
+
+def write_lines(place: Path, lines: int) -> int:
+    """Lines as soundings.parquet below `place`; how many soundings."""
+    settings = {'lines': min(GROUP, lines), 'cross_lines': 0, 'terrain': 'slope', 'length': 100.0}
+    scene = simulate(scenario('survey', {**settings, 'fish': False, 'ghost': False}), 1)
+    for k in range(lines):
+        moved = scene.points[k % GROUP].moved((0.0, k // GROUP * GROUP * SPACING, 0.0))
+        folder = place / f'line_{k:05d}'
+        folder.mkdir(parents=True)
+        columns = {'stamp_ns': moved.stamp_ns, **moved.columns}
+        columns |= {f'p{name}': moved[name] for name in 'xyz'}
+        pyarrow.parquet.write_table(pyarrow.table(columns), folder / 'soundings.parquet')
+    return sum(len(scene.points[k % GROUP]) for k in range(lines))
 
 
 def one_run(terrain: str, slope: float, cell: float, seed: int) -> dict[str, float]:
@@ -272,4 +329,4 @@ def scores(floor: Floor, place: FloatArray, z: FloatArray, sd: FloatArray) -> di
 
 
 if __name__ == '__main__':
-    study(main, parts={'choices': ['one_run', 'walls', 'survey']})
+    study(main, parts={'choices': PARTS})

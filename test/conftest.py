@@ -8,15 +8,13 @@
 
 """Set up what has to be set before rclpy is imported anywhere."""
 
-import contextlib
 import gc
 import importlib.util
 import os
-from pathlib import Path
-import subprocess
 import tempfile
 
 from helpers.kernel_types import in_effect
+from helpers.source import commits
 import hypothesis
 import pytest
 
@@ -83,16 +81,6 @@ def pytest_collection_modifyitems(config, items):
     left_out = set(statistics) - set(run)
     config.hook.pytest_deselected(items=sorted(left_out, key=lambda item: item.nodeid))
     items[:] = [item for item in items if item not in left_out]
-
-
-def commits():
-    """How many commits there are, which chooses the share; 0 outside of a checkout."""
-    command = ['git', '-C', str(Path(__file__).parent), 'rev-list', '--count', 'HEAD']
-    with contextlib.suppress(OSError):
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode == 0:
-            return int(done.stdout)
-    return 0
 
 
 def pytest_report_header():

@@ -21,11 +21,9 @@ particles in all. Both suppose the scene of the paper, two random walks and nois
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime, timedelta
 from functools import partial
 import math
-import os
 import time
 from typing import Any
 
@@ -306,44 +304,6 @@ def bench_stone_soup(rounds: int = 7) -> dict[str, Any]:
     return {'bins_per_second': speed, 'ratio': speed['particles'] / speed['stone_soup']}
 
 
-def bench_scaling(rounds: int = 7) -> dict[str, Any]:
-    """Bins a second with more particles of each model (N), more staves (P)."""
-    ping = a_ping()
-    variants: dict[str, tuple[dict[str, Any], Snapshot]] = {}
-    for N in (50, 100, 300, 1000):
-        variants[f'N = {N}'] = {'sigmas': SIGMAS, 'particles_per_model': N}, ping
-    for P in (2, 4, 8, 16, 32):
-        variants[f'P = {P}'] = {'sigmas': SIGMAS}, a_ping(staves=P)
-    methods: dict[str, Timed] = {}
-    for name, (values, shot) in variants.items():
-        tracker = BathymetryTracker(
-            BathymetryConfig(**{**WALKS, 'gate_false_alarm': 1.0, **values})
-        )
-        methods[name] = partial(tracker.process, shot), len(shot)
-    return {'bins_per_second': rates(methods, rounds)}
-
-
-def bench_threads(rounds: int = 7, pings: int = 16) -> dict[str, Any]:
-    """Bins a second of one tracker, and of one in each of several threads: the kernels release
-    Python's lock. The best of `rounds` rounds in turn."""
-    ping = a_ping()
-
-    def together(trackers: list[BathymetryTracker]) -> None:
-        with ThreadPoolExecutor(len(trackers)) as pool:
-            list(pool.map(lambda each: [each.process(ping) for _ in range(pings)], trackers))
-
-    most = min(4, os.cpu_count() or 1)
-    groups = {
-        n: [BathymetryTracker(config(gate_false_alarm=1.0)) for _ in range(n)]
-        for n in sorted({1, most})
-    }
-    methods = {
-        str(n): (partial(together, trackers), n * pings * len(ping))
-        for n, trackers in groups.items()
-    }
-    return {'bins_per_second': rates(methods, min(rounds, 3))}
-
-
 def _heights(ping: Snapshot) -> np.ndarray:
     tracker = BathymetryTracker(config(gate_false_alarm=1.0))
     return tracker.process(ping)[0].state[:, 0]
@@ -386,20 +346,9 @@ def _stone_soup_sentence(result: Mapping[str, Any]) -> str:
     )
 
 
-def _rates_sentence(result: Mapping[str, Any], what: str) -> str:
-    each = ', '.join(f'{name} {speed:,.0f}' for name, speed in result['bins_per_second'].items())
-    return f'{what}: {each} bins/s'
-
-
 BENCHES = (
     Bench('numpy', bench_numpy, _numpy_sentence),
     Bench('sea', bench_sea, _sea_sentence),
     Bench('layover', bench_layover, _layover_sentence),
     Bench('stone_soup', bench_stone_soup, _stone_soup_sentence),
-    Bench(
-        'scaling',
-        bench_scaling,
-        partial(_rates_sentence, what='models (M), particles of each (N), staves (P)'),
-    ),
-    Bench('threads', bench_threads, partial(_rates_sentence, what='trackers in so many threads')),
 )

@@ -26,7 +26,7 @@ from benchmarks.speed import Bench, seconds_of
 from sonar_imm.estimation import bank, imm
 from sonar_imm.estimation.arrays import FloatArray, IndexArray
 from sonar_imm.estimation.association import assign, association_cost, gate_threshold
-from sonar_imm.measurements import Fix, Fixes
+from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.tracker import DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
@@ -36,7 +36,6 @@ MANY = 20
 """Targets at once: ten divers and as many tentative tracks."""
 RATIO_WANTED = 3.0
 SCAN_WANTED_MS = 100.0
-STAMPS_WANTED = 1.5
 CLUTTER_WANTED_MS = 0.3
 
 HEADINGS = DiverConfig(model_set='heading_speed')
@@ -216,32 +215,6 @@ def _scan(
     return block, mu, len(hit)
 
 
-def bench_stamps(rounds: int = 7, fixes: int = 120) -> dict[str, Any]:
-    """CPU milliseconds that a whole tracker takes for a fix, with stamps every second and with
-    stamps that never have the same distance twice, and their ratio in paired rounds. CPU time,
-    because threads that nobody asked for show in nothing else."""
-    DiverTracker(HEADINGS).warm()
-    regular, irregular = (
-        _fixes(np.ones(fixes)),
-        _fixes(np.random.default_rng(2).uniform(0.5, 1.5, fixes)),
-    )
-    pairs = np.array(
-        [[_cpu_of_tracking(regular), _cpu_of_tracking(irregular)] for _ in range(rounds)]
-    )
-    pairs *= 1e3 / fixes
-    ratio = pairs[:, 1] / pairs[:, 0]
-    return {
-        'fixes': fixes,
-        'rounds': rounds,
-        'regular_cpu_ms': float(np.median(pairs[:, 0])),
-        'irregular_cpu_ms': float(np.median(pairs[:, 1])),
-        'ratio': float(np.median(ratio)),
-        'ratio_highest': float(ratio.max()),
-        'ratio_wanted': STAMPS_WANTED,
-        'good': bool(np.median(ratio) <= STAMPS_WANTED),
-    }
-
-
 def bench_clutter(rounds: int = 7, scans: int = 200) -> dict[str, Any]:
     """CPU milliseconds that a whole tracker takes for a scan of four divers and three false fixes
     on average, with either association in turn."""
@@ -263,20 +236,6 @@ def bench_clutter(rounds: int = 7, scans: int = 200) -> dict[str, Any]:
         'wanted_ms': CLUTTER_WANTED_MS,
         'good': bool(max(gnn, jipda) <= CLUTTER_WANTED_MS),
     }
-
-
-def _fixes(steps: FloatArray) -> list[Fix]:
-    """A diver at .4 m/s, seen after each of `steps` (K,) seconds."""
-    noise = np.random.default_rng(3).normal(0.0, 0.5, (len(steps), 2))
-    time_s = np.cumsum(steps)
-    return [
-        Fix(
-            stamp_ns=10**9 + round(1e9 * seconds),
-            position=np.array([0.4 * seconds + dx, dy, 0.0]),
-            covariance=0.25 * np.eye(2),
-        )
-        for seconds, (dx, dy) in zip(time_s.tolist(), noise)
-    ]
 
 
 def _cpu_of_tracking(items: Sequence[Any], config: DiverConfig | None = None) -> float:
@@ -307,15 +266,6 @@ def _scan_sentence(scan: Mapping[str, Any]) -> str:
     )
 
 
-def _stamps_sentence(stamps: Mapping[str, Any]) -> str:
-    return (
-        f'tracker, CPU for a fix: {stamps["regular_cpu_ms"]:.2f} ms every second, '
-        f'{stamps["irregular_cpu_ms"]:.2f} ms at irregular stamps: {stamps["ratio"]:.2f} times as '
-        f'much (wanted at most {stamps["ratio_wanted"]:.1f}; highest of {stamps["rounds"]} paired '
-        f'rounds {stamps["ratio_highest"]:.2f})'
-    )
-
-
 def _clutter_sentence(clutter: Mapping[str, Any]) -> str:
     return (
         f'tracker, CPU for a scan of 4 divers and 3 false fixes: {clutter["gnn_cpu_ms"]:.2f} ms '
@@ -327,6 +277,5 @@ def _clutter_sentence(clutter: Mapping[str, Any]) -> str:
 BENCHES = (
     Bench('step', bench_step, _step_sentence),
     Bench('scan', lambda rounds: bench_scan(), _scan_sentence),
-    Bench('stamps', bench_stamps, _stamps_sentence),
     Bench('clutter', bench_clutter, _clutter_sentence),
 )

@@ -88,24 +88,6 @@ def bench_record(records: int = 12) -> dict[str, Any]:
     }
 
 
-def bench_threads(threads: int = 4, records: int = 9) -> dict[str, Any]:
-    """Milliseconds of a record on one core and on `threads`, which must give the same bytes."""
-    median, results = {}, []
-    for count in (1, threads):
-        rng = np.random.default_rng(0)
-        tracker = FathometerTracker(FathometerConfig(particles=PARTICLES, threads=count))
-        times, states = [], b''
-        for record in range(records):
-            record_trace = trace(record, rng)
-            begin = time.perf_counter()
-            estimates = tracker.process(record_trace)
-            times.append(1e3 * (time.perf_counter() - begin))
-            states += b''.join(e.state.tobytes() + e.probabilities.tobytes() for e in estimates)
-        median[str(count)] = float(np.median(times[3:]))
-        results.append(states)
-    return {'median_ms': median, 'same_bytes': (same := results[0] == results[1]), 'good': same}
-
-
 def bench_array(
     rounds: int = 7, snapshots: int = 64, length: int = 16_800, hydrophones: int = 32
 ) -> dict[str, Any]:
@@ -225,12 +207,6 @@ def _likelihood_sentence(result: Mapping[str, Any]) -> str:
     )
 
 
-def _threads_sentence(result: Mapping[str, Any]) -> str:
-    each = ', '.join(f'{ms:.1f} ms on {count}' for count, ms in result['median_ms'].items())
-    same = 'the same bytes' if result['same_bytes'] else 'OTHER BYTES'
-    return f'a record on so many threads: {each}; {same}'
-
-
 def _array_sentence(result: Mapping[str, Any]) -> str:
     each = ', '.join(f'{name} {spent:,.0f} ms' for name, spent in result['ms'].items())
     return f'{result["snapshots"]} snapshots of 32 hydrophones: {each}'
@@ -239,6 +215,5 @@ def _array_sentence(result: Mapping[str, Any]) -> str:
 BENCHES = (
     Bench('record', lambda rounds: bench_record(), _record_sentence),
     Bench('likelihood', bench_likelihood, _likelihood_sentence),
-    Bench('threads', lambda rounds: bench_threads(), _threads_sentence),
     Bench('array', bench_array, _array_sentence),
 )

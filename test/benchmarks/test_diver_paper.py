@@ -141,14 +141,3 @@ def test_sixteen_directions_beat_one():
         errors[name] = diver_paper.rmse(estimate, truth)
     assert max(errors.values()) == errors['fixes']
     assert 1.15 * errors['heading_speed'] < errors['one'] < errors['fixes']
-
-
-@pytest.mark.parametrize('model_set', ['bench_cv', 'bench_cv_ct'])
-def test_a_filter_with_one_direction_is_tuned(model_set):
-    found = diver_paper.tuned(model_set, ['table1'], 3)
-    assert found.acceleration_noise in diver_paper.NOISES[model_set]
-
-
-def test_the_smoother_beats_the_filter():
-    for row in diver_paper.smoothing(2).values():
-        assert row['smoother'] < 0.8 * row['filter']

@@ -15,7 +15,6 @@ import pytest
 from benchmarks.landmark import LandmarkTracker, unscented_transform, update
 from benchmarks.obstacle_accuracy import config_of, track
 from sonar_imm.estimation import kalman
-from sonar_imm.estimation.smoothing import sigma_offsets
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 RANGE_BEARING = np.array([False, True])
@@ -31,17 +30,6 @@ def range_bearing(points):
 def covariance(rng, *shape):
     root = rng.normal(size=(*shape, shape[-1] + 1))
     return root @ np.swapaxes(root, -1, -2)
-
-
-@pytest.mark.parametrize('n', range(1, 8))
-def test_points_have_the_moments_and_no_negative_weight(n):
-    P = covariance(np.random.default_rng(n), 3, n)
-    offsets, weights = sigma_offsets(P)
-    assert (weights >= 0.0).all() and weights.sum() == pytest.approx(1.0, abs=1e-15)
-    np.testing.assert_allclose(np.einsum('s,bsi->bi', weights, offsets), 0.0, atol=1e-14)
-    np.testing.assert_allclose(
-        np.einsum('s,bsi,bsj->bij', weights, offsets, offsets), P, rtol=1e-12, atol=1e-13
-    )
 
 
 @pytest.mark.parametrize('n', [2, 4, 6])

@@ -19,7 +19,6 @@ from helpers.source import ROOT
 import pytest
 
 from benchmarks import study
-from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.offline.tracking import InputOptions
 
@@ -64,13 +63,6 @@ def test_the_file_holds_what_is_known_when_a_run_is_broken_off(monkeypatch, tmp_
     assert study.known(tmp_path / 'none') == study.known(None) == {}
 
 
-@pytest.mark.parametrize('words', [['--cases', 'd'], ['--runs', 'many'], ['--none', '1']])
-def test_a_wrong_option_is_refused(monkeypatch, words):
-    with pytest.raises(SystemExit) as ended:
-        run(monkeypatch, numbers, *words, cases={'choices': ['a', 'b']})
-    assert ended.value.code == 2
-
-
 def test_a_fresh_process_is_another_one_and_its_errors_arrive():
     assert study.in_fresh_process(os.getpid) != os.getpid()
     with pytest.raises(ZeroDivisionError):
@@ -103,24 +95,6 @@ def test_a_file_says_how_it_was_made(tmp_path):
 
 
 # -- many seeds of one scene ----------------------------------------------------------------------
-
-TINY = {
-    'bathymetry': ('paper', {'pings': '1', 'last_range': '22'}, 'height.all.rmse_m'),
-    'diver': ('table1', {'duration': '15'}, 'position.rmse_m'),
-    'fathometer': ('drift_traces', {'records': '2'}, 'ospa_m'),
-    'obstacle': ('approach', {'first_range': '30', 'last_range': '20'}, 'gospa.mean_m'),
-}
-"""Scenario, settings that make it small, and a metric that needs truth, by system."""
-
-
-@pytest.mark.parametrize('system', list(SYSTEMS))
-def test_each_system_is_simulated_tracked_and_scored(system):
-    name, overrides, metric = TINY[system]
-    plan = study.planned(system, name, overrides)
-    first, second, again = study.run_seeds(plan, [3, 4, 3], 1)
-    assert not first.failure and first.versions['sonar_imm']
-    assert metric in first.metrics
-    assert first == again and first.metrics != second.metrics
 
 
 def test_a_seed_scores_as_simulate_track_and_evaluate_say(tmp_path, capsys):

@@ -193,11 +193,6 @@ def test_a_reader_that_goes_away_is_no_trouble():
     process.stderr.close()
 
 
-def test_the_module_runs_as_the_command():
-    done = run('info', 'nowhere.bag')
-    assert done.returncode == 2 and done.stderr == 'sonar-imm: nowhere.bag does not exist\n'
-
-
 def test_help_is_fast():
     """In seconds of work, however busy the machine is."""
     resource = pytest.importorskip('resource')

@@ -186,3 +186,19 @@ def test_a_full_disk_is_named(command, dive, tmp_path, capsys):
     errors = capsys.readouterr().err
     assert code == 2 and 'Traceback' not in errors
     assert str(out) in errors and 'File too large' in errors
+
+
+def test_detections_kept_in_a_bag_give_the_same_tracks(call, tmp_path, capsys):
+    bag, kept, *outs = (tmp_path / name for name in ('images', 'kept', 'first', 'second'))
+    words = ('last_range=33', 'image_beams=64', 'image_bins=200', 'target=point')
+    settings = [word for given in words for word in ('--set', given)]
+    assert main(['simulate', 'obstacle', str(bag), '--scenario', 'images', *settings]) == 0
+    call('convert', 'images', bag, kept)
+    run = call('track', bag, outs[0])
+    call('track', kept, outs[1], '--params', bag / 'parameters.yaml')
+    tables = [(out / 'estimate.csv').read_bytes() for out in outs]
+    assert tables[0] == tables[1] and len(tables[0].splitlines()) > 10
+    assert run['topics']['/image'] == 'image' and run['detector']['image_far_range'] == 55.0
+    call('track', bag, tmp_path / 'none', '--set', 'sidelobe_db=0.0')
+    assert main(['track', str(bag), str(tmp_path / 'bad'), '--set', 'sidelob_db=1.0']) == 2
+    assert 'sidelob' in capsys.readouterr().err

@@ -32,6 +32,7 @@ from sonar_imm_tools.recordings.messages import ros_message
 
 STAMP = 10**18
 F, N = 5, 4
+EMPTY = np.empty((0, N), np.int16)
 
 
 def spectra(**changes):
@@ -196,14 +197,13 @@ def test_pressure_at_the_limit_of_its_whole_numbers_is_clipped_and_keeps_its_sig
         ({'p': np.ones((50, 2), np.float32)}, 'bad_hydrophones'),
         ({'sample_rate': np.zeros(50, np.float32)}, 'out_of_range'),
         ({'sample_rate': np.linspace(1e4, 2e4, 50, dtype=np.float32)}, 'not_constant'),
+        ({'rows': 1}, 'too_short'),
+        ({'rows': 0}, 'too_short'),
+        ({'rows': 0, 'p': EMPTY, 'scale': np.float32(EMPTY[:, 0])}, 'bad_scale'),
     ],
 )
 def test_hostile_pressure_is_named(changes, expected):
     assert reason(read_pressure, pressure_table(**changes)) == expected
-
-
-def test_pressure_of_one_row_is_too_short():
-    assert reason(read_pressure, pressure_table(rows=1)) == 'too_short'
 
 
 def test_a_dead_hydrophone_does_not_spoil_the_block():
@@ -288,13 +288,3 @@ def test_bytes_of_any_kind_are_read_or_refused(data, read):
         read(good)
     except Rejection as rejection:
         assert rejection.sentence
-
-
-@pytest.mark.parametrize('whole_numbers', [False, True])
-def test_pressure_without_a_sample_is_refused(whole_numbers):
-    columns = {'p': np.empty((0, 4), np.float32), 'sample_rate': np.empty(0, np.float32)}
-    if whole_numbers:
-        columns |= {'p': np.empty((0, 4), np.int16), 'scale': np.empty(0, np.float32)}
-    message = encode_table(columns, stamp_ns=STAMP, frame_id='array', make=ros_message)
-    with pytest.raises(Rejection):
-        read_pressure(message)

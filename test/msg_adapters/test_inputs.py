@@ -67,11 +67,6 @@ def test_each_class_of_measurements_is_heard_under_one_name():
     assert received == set(get_args(Measurement))
 
 
-def test_an_unknown_system_has_no_inputs():
-    with pytest.raises(ModuleNotFoundError):
-        inputs_of('whale')
-
-
 # -- Names of tags and sensors, from topics and frames --
 
 

@@ -160,13 +160,6 @@ class TestEncode:
         assert message.point_step == 21 and message.row_step == 21 and len(message.data) == 21
         assert message.header.stamp.sec == 1 and message.header.stamp.nanosec == 7
 
-    def test_dense_says_whether_all_is_finite(self):
-        assert encode({'a': np.float64([1.0])}).is_dense
-        assert not encode({'a': np.float64([np.nan])}).is_dense
-
-    def test_booleans_become_bytes(self):
-        assert decode_table(encode({'a': np.array([True, False])}))['a'].tolist() == [1, 0]
-
     @pytest.mark.parametrize(
         'columns',
         [

@@ -61,19 +61,18 @@ def test_defaults_and_descriptors(start):
 
 
 def test_start_values_reach_the_tracker(start):
-    node = start('sound_speed:=1400.5', 'steps:=5', 'weights:=[0.5, 1.0]', 'mood:=hasty')
-    config = node.tracker.config
-    assert (config.sound_speed, config.steps, config.weights, config.mood) == (
-        1400.5,
-        5,
-        (0.5, 1.0),
-        'hasty',
+    given = (
+        'sound_speed:=1400.5',
+        'steps:=5',
+        'weights:=[0.5, 1.0]',
+        'mood:=hasty',
+        'offsets:=[]',
     )
+    node = start(*given)
+    config = node.tracker.config
+    assert (config.sound_speed, config.steps, config.mood) == (1400.5, 5, 'hasty')
+    assert (config.weights, config.offsets) == ((0.5, 1.0), ())
     assert list(node.get_parameter('weights').value) == [0.5, 1.0]
-
-
-def test_an_empty_list_empties_a_list(start):
-    assert start('offsets:=[]').tracker.config.offsets == ()
 
 
 @pytest.mark.parametrize(

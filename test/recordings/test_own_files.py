@@ -61,20 +61,8 @@ def test_the_file_is_one_of_ros(tmp_path):
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     bag = tmp_path_factory.mktemp('own') / 'scene'
-    assert (
-        main(
-            [
-                'simulate',
-                'obstacle',
-                str(bag),
-                '--set',
-                'sonar_lever=2,0,-0.3',
-                '--set',
-                'last_range=80',
-            ]
-        )
-        == 0
-    )
+    settings = ('--set', 'sonar_lever=2,0,-0.3', '--set', 'last_range=80')
+    assert main(['simulate', 'obstacle', str(bag), *settings]) == 0
     return bag
 
 
@@ -109,25 +97,17 @@ def test_a_spoilt_file_is_one_sentence(bag, tmp_path, capsys):
 # -- the limit ------------------------------------------------------------------------------------
 
 
-def test_a_limit_that_is_written_is_read_and_without_a_file_there_is_none(tmp_path):
+def test_a_limit_and_how_a_recording_is_made_again_are_kept(tmp_path):
     assert own_limit(tmp_path) is None
-    write_own_limit(tmp_path, 0.88)
-    assert own_limit(tmp_path) == 0.88
-
-
-def test_how_a_recording_is_made_again_is_kept(tmp_path):
-    recipe = ['--scenario', 'a scene', '--set', 'fading=']
-    write_own_limit(tmp_path, 0.5, recipe)
-    assert own_recipe(tmp_path) == recipe
-    assert own_limit(tmp_path) == 0.5
-
-
-def test_a_recording_without_a_recipe_is_one_sentence(tmp_path):
-    with pytest.raises(BagError, match='does not state how'):
-        own_recipe(tmp_path)
-    write_own_limit(tmp_path, 0.5)
-    with pytest.raises(BagError, match='does not state how'):
-        own_recipe(tmp_path)
+    for recipe in (None, [], ['--scenario', 'a scene', '--set', 'fading=']):
+        if recipe is not None:
+            write_own_limit(tmp_path, 0.88, recipe)
+            assert own_limit(tmp_path) == 0.88
+        if recipe:
+            assert own_recipe(tmp_path) == recipe
+            continue
+        with pytest.raises(BagError, match='does not state how'):
+            own_recipe(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -141,15 +121,10 @@ def test_a_recording_without_a_recipe_is_one_sentence(tmp_path):
         ('limit: .inf', 'finite'),
         ('limit: -1', 'not negative'),
         ('limit: [', 'not YAML'),
+        ('\udcff\udcfe\x00limit', 'not YAML'),
     ],
 )
 def test_any_other_limit_is_one_sentence(tmp_path, text, sentence):
-    (tmp_path / 'check.yaml').write_text(text)
+    (tmp_path / 'check.yaml').write_text(text, errors='surrogateescape')
     with pytest.raises(BagError, match=sentence):
-        own_limit(tmp_path)
-
-
-def test_a_limit_of_bytes_is_one_sentence(tmp_path):
-    (tmp_path / 'check.yaml').write_bytes(b'\xff\xfe\x00limit')
-    with pytest.raises(BagError, match='not YAML'):
         own_limit(tmp_path)

@@ -23,9 +23,7 @@ from helpers.source import ROOT
 import pytest
 
 from sonar_imm.files import UNFINISHED
-from sonar_imm_tools.offline.batch import run_folders
 from sonar_imm_tools.offline.run_folder import RunFolder
-from sonar_imm_tools.recordings.reader import BagReader
 
 pytestmark = pytest.mark.system
 MOMENTS = count(6, 20)
@@ -74,38 +72,8 @@ def _killed(bag, out, moment):
     return time.perf_counter() - begin
 
 
-def test_a_killed_command_goes_on_where_it_was(tmp_path):
-    bags = [write_dive(tmp_path / f'bag{k}', spoilt=range(k)) for k in range(8)]
-    out = tmp_path / 'out'
-    arguments = command('track', *bags, out)
-    with subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.DEVNULL) as it:
-        while it.poll() is None and len(list(out.glob('bag?/run.json'))) < 2:
-            time.sleep(0.005)
-        it.send_signal(signal.SIGKILL)
-    before = {path: path.stat().st_mtime_ns for path in out.glob('bag?/run.json')}
-    assert len(before) >= 2 and all(whole_run(path.parent) for path in before)
-    again = subprocess.run(arguments, cwd=ROOT, check=True, capture_output=True, text=True)
-    assert f'{8 - len(before)} tracked, {len(before)} kept, 0 failed' in again.stdout
-    assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert len(run_folders(out)) == 8 and all(whole_run(path) for path in run_folders(out))
-    assert not [path for path in out.iterdir() if UNFINISHED in path.name]
-
-
-def test_a_bag_that_is_being_written_is_not_there(tmp_path):
-    out = tmp_path / 'scene'
-    arguments = command('simulate', 'obstacle', out)
-    with subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.DEVNULL) as it:
-        while it.poll() is None and not list(tmp_path.glob(f'scene{UNFINISHED}*/scene/*.mcap')):
-            time.sleep(0.002)
-        it.send_signal(signal.SIGKILL)
-    if out.exists():  # it was faster
-        with BagReader(out) as bag:
-            assert not bag.problems
-    assert all(path.name.startswith('scene') for path in tmp_path.iterdir())
-
-
 def test_a_worker_that_is_killed_costs_a_survey_its_job_only(tmp_path):
-    """While lines are read, while statistics are made, and while tiles are."""
+    """While lines are read, and while tiles are made."""
     pytest.importorskip('rasterio')
     pytest.importorskip('pyarrow')
     lines = tmp_path / 'lines'
@@ -113,7 +81,7 @@ def test_a_worker_that_is_killed_costs_a_survey_its_job_only(tmp_path):
     simulate = command('simulate', 'survey', lines, '--soundings', *small)
     subprocess.run(simulate, cwd=ROOT, check=True)
     first = None
-    for work in (None, 'lines/*.npz', 'looks/*.npy', 'tiles/*.npz'):
+    for work in (None, 'lines/*.npz', 'tiles/*.npz'):
         out = tmp_path / f'out{len(list(tmp_path.iterdir()))}'
         arguments = command('survey', lines, out, '--adjust', '--jobs', 2)
         with subprocess.Popen(arguments, cwd=ROOT, stderr=subprocess.PIPE, text=True) as it:

@@ -25,19 +25,26 @@ import subprocess
 import sys
 
 from helpers.forked import commands
-from helpers.source import ROOT
+from helpers.source import commits, ROOT
 import pytest
 
 from sonar_imm_tools.replay.harness import reserved_domain_id
 
 pytestmark = pytest.mark.system
 
-PAGES = sorted(
-    path
+TUTORIALS, HOWTO = (
+    sorted(
+        path
+        for path in (ROOT / 'docs' / folder).glob('*.md')
+        if '\n```bash\n' in path.read_text(encoding='utf-8')
+    )
     for folder in ('tutorials', 'howto')
-    for path in (ROOT / 'docs' / folder).glob('*.md')
-    if '\n```bash\n' in path.read_text(encoding='utf-8')
 )
+EVERY = os.environ.get('SONAR_IMM_PAGES') == 'all'
+"""Whether all pages are run, as `.ci/run` does; else the tutorials and two of the others, which
+change with each commit."""
+TURN = 2 * commits() % len(HOWTO)
+PAGES = [*TUTORIALS, *(HOWTO if EVERY else (2 * HOWTO)[TURN : TURN + 2])]
 NUMBER = re.compile(r'-?\d+(?:\.\d+)?|-?\.\d+')
 LONGEST = 300.0
 """Seconds that a page may take on a busy machine."""

@@ -34,7 +34,7 @@ def test_after_a_gap_it_is_as_if_there_had_been_none(gap):
         bounds.append({'right': known[:, 0], 'found': kalman(traces, truth, gap), 'ids': known})
     found, bound = summary(runs), summary(bounds)
     assert found['P, 1st'] >= 0.75 and found['P, 2nd'] >= 0.875 and found['P, later'] >= 0.95
-    assert found['found, 1st'] >= 0.95 and found['identities, 4th'] >= 0.95
+    assert found['found, 1st'] >= 0.95 and found['kept, 4th'] >= 0.95
     # 48 layers leave .03 of chance.
     assert found['inside, 1st'] >= 0.88 and found['inside, later'] >= 0.93
     assert found['error, 1st, m'] <= 1.5 * bound['error, 1st, m']

@@ -18,7 +18,7 @@ import numpy as np
 from oracles.set_particles import weigh
 import pytest
 
-from benchmarks import fathometer_pulse
+from benchmarks import fathometer_accuracy
 from sonar_imm.estimation.set_filter import SetFilter, Weighted
 from sonar_imm.estimation.set_model import SetModel
 from sonar_imm.parameters import ConfigError
@@ -107,12 +107,12 @@ def test_negative_layers_are_found_where_they_are_looked_for():
 
 def test_negative_layers_under_an_array_are_found_at_the_defaults():
     """Six layers, of which two are negative, as cross-spectra; traces keep the plain defaults."""
-    config, floor, rng = fathometer_pulse.layers(7, 10, fathometer_pulse.SIGNS['signed'])
+    config, floor, rng = fathometer_accuracy.layers(7, 10, fathometer_accuracy.SIGNS['signed'])
     settings = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
     settings |= {'depth_min': config.depth_min, 'depth_max': config.depth_max, 'particles': 3000}
     settings |= {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
     tracker = FathometerTracker(FathometerConfig(**settings, window='rectangular', overlap=0.0))
-    spectra, depth, amplitude = zip(*fathometer_pulse.records_of(config, floor, rng))
+    spectra, depth, amplitude = zip(*fathometer_accuracy.records_of(config, floor, rng))
     *_, (found,) = map(tracker.process, spectra)
     assert found.state[:, 0] == pytest.approx(depth[-1], abs=0.2)
     assert np.array_equal(found.extras['polarity'], np.sign(amplitude[-1]))

@@ -13,8 +13,7 @@ from helpers.fathometer_runs import run
 import numpy as np
 import pytest
 
-from benchmarks.fathometer_dips import BEFORE, case, LAYERS, summary
-from benchmarks.fathometer_gaps import tracked
+from benchmarks.fathometer_gaps import BEFORE, DIPPING, dipping, summary, tracked
 from msg_adapters.displays.fathometer import Displays
 from msg_adapters.displays.tracks import MODELS
 from sonar_imm.trackers.fathometer.config import FathometerConfig
@@ -38,19 +37,19 @@ OPTIONS = {'particles': 4000}
                                                  ('turn', 0.4, 0), ('fan', 0.4, 0),
                                                  ('parallel', 0.4, 30)])  # fmt: skip
 def test_layers_that_dip_are_followed_without_a_parameter(kind, dip, gap):
-    found = summary([tracked(*case(kind, dip, gap, seed), **OPTIONS) for seed in range(3)])
+    found = summary([tracked(*dipping(kind, dip, gap, seed), **OPTIONS) for seed in range(3)])
     assert found['P, before'] >= 0.9 and found['P, later'] >= 0.9
     assert found['inside, before'] >= 0.93 and found['inside, after'] >= 0.93
-    assert found['identities'] <= len(LAYERS) + 2.0 and found['kept, 4th'] >= 0.95
+    assert found['named'] <= len(DIPPING) + 2.0 and found['kept, 4th'] >= 0.95
     assert found['dipping'] > 0.9
 
 
 def test_layers_that_are_still_are_called_so():
-    traces, truth = case('parallel', 0.0, 0, 0)
+    traces, truth = dipping('parallel', 0.0, 0, 0)
     tracker, found = run(traces, **OPTIONS)
     last = max(found.values(), key=lambda each: each.stamp_ns)
-    assert len(last) == len(LAYERS) and last.extras['dipping'].mean() < 0.3
-    dips, _ = case('parallel', -0.2, 0, 0)
+    assert len(last) == len(DIPPING) and last.extras['dipping'].mean() < 0.3
+    dips, _ = dipping('parallel', -0.2, 0, 0)
     _, found = run(dips, **OPTIONS)
     last = max(found.values(), key=lambda each: each.stamp_ns)
     assert last.extras['dipping'].mean() > 0.9
@@ -61,7 +60,7 @@ def test_layers_that_are_still_are_called_so():
 
 
 def test_still_or_dipping_is_shown_beside_the_order():
-    traces, _ = case('parallel', 0.2, 0, 0)
+    traces, _ = dipping('parallel', 0.2, 0, 0)
     _, found = run(traces[:6], particles=500)
     estimate = found[traces[5].stamp_ns]
     drawn = dict(Displays().of(estimate, lambda message, /, **fields: fields, lambda topic: True))
@@ -149,7 +148,7 @@ def test_walks_lead_where_slopes_do():
 
 @pytest.mark.parametrize('options', [{'slope_std': 0.0}, {'heave': 'independent'}])
 def test_where_no_slopes_are_followed_all_are_still(options):
-    traces, _ = case('parallel', 0.0, 0, 1)
+    traces, _ = dipping('parallel', 0.0, 0, 1)
     _, found = run(traces[: BEFORE // 2], particles=500, **options)
     for estimate in found.values():
         assert not estimate.extras['dipping'].any() and not estimate.extras['slope_std'].any()
