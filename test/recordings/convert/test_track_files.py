@@ -9,6 +9,7 @@
 """Positions in GPX, KML and GeoJSON become what the same positions in a CSV become."""
 
 import json
+import struct
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -231,3 +232,19 @@ def test_geojson_in_a_system_that_is_not_known_is_one_sentence(tmp_path):
     (tmp_path / 'dive.geojson').write_text(json.dumps(whole))
     with pytest.raises(BagError, match="'our own grid', which is not known"):
         convert_fixes(tmp_path / 'dive.geojson', tmp_path / 'bag')
+
+
+@pytest.mark.parametrize('name, layer', [('a.gpx', 'track_points'), ('d.geojson', None)])
+def test_gdal_reads_the_same_places(tmp_path, name, layer):
+    pyogrio = pytest.importorskip('pyogrio')
+    path = tmp_path / name
+    path.write_text(TEXTS[name]())
+    _, _, geometry, _ = pyogrio.raw.read(path, layer=layer)
+    there = np.array([struct.unpack('<2d', each[5:21]) for each in geometry])
+    report = convert_truth(path, tmp_path / 'truth', origin=(54.0, 10.0))
+    assert report.rows == len(there) == 4
+    report = convert_fixes(path, tmp_path / 'bag', origin=(54.0, 10.0))
+    places = np.concatenate([scan.position[:, :2] for scan in fixes_of(report.path)])
+    wanted = np.transpose(pymap3d.geodetic2enu(*there.T[::-1], 0.0, 54.0, 10.0, 0.0))[:, :2]
+    # As high as they are, they lie a little nearer.
+    assert sorted(places.tolist()) == pytest.approx(np.array(sorted(wanted.tolist())), abs=0.05)
