@@ -60,11 +60,6 @@ ELSEWHERE = [
     ),
     ('matlab_dates', 'recordings/test_times.py', 'forms_of_dates_and_times'),
     ('zero_zero (target)', 'msg_adapters/test_fixes.py', 'latitude_0_longitude_0_is_no_fix'),
-    (
-        'image_and_odometry',
-        'cli/test_frames.py',
-        'the_only_odometry_beside_detections_is_found_by_its_type',
-    ),
     ('unknown_usbl_type', 'cli/test_info.py', 'a_type_that_nobody_hears_names_what_would_do'),
     ('folder_not_utf8', 'cli/test_names.py', 'any_locale_will_do'),
     (
@@ -398,6 +393,9 @@ CASES = [
            made.pictures(folder / 'b', sector), ('track b run --system obstacle --topic nav=/odom '
            f'--topic image=/sonar/image --set image_far_range=40.0 --set image_fov_deg={sector}',),
            knows_the_obstacle) for sector in (70.0, 120.0)),
+    Case('image_and_odometry', lambda folder: made.pictures(folder / 'b', 90.0),
+         ('track b run --system obstacle --set image_far_range=40.0 --set image_fov_deg=90.0',),
+         knows_the_obstacle),
     Case('ghost_line', profile, ('convert segy line.sgy b', 'track b run'), has_no_ghosts),
 ]  # fmt: skip
 
