@@ -9,11 +9,10 @@
 """Position fixes and starts of tracks: in metres (geometry_msgs PoseWithCovarianceStamped or
 PointStamped), relative to a vessel, and in latitude and longitude.
 
-Publishers fill in covariances in different ways. Of the x-y block a negative variance or a number
-that is not finite means unknown. All zeros mean that it was not filled in: unknown too, and worth
-a warning (see `doubt_fix`). Anything else has to be symmetric and positive definite, or the fix is
-refused. What is stated of z is used with it, or left out where it cannot be true
-(`measurements.in_space`).
+Publishers fill in covariances in different ways: `measurements.variances` has the table. All zeros
+are worth a warning (see `doubt_fix`). What is stated of x and y has to be symmetric and positive
+definite, or the fix is refused. What is stated of z is used with it, or left out where it cannot
+be true (`measurements.in_space`).
 
 Positions that a transceiver on a vessel has measured from itself (USBL), and those of
 geographic_msgs, are read by field names, so that the packages of the drivers need not be
@@ -47,8 +46,12 @@ from sonar_imm.measurements import (
     Start,
     VesselFix,
 )
-from sonar_imm.measurements.checks import check_covariance
-from sonar_imm.measurements.diver import UNKNOWN_VARIANCE
+from sonar_imm.measurements.variances import (
+    check_flat,
+    is_stated,
+    LEAST_VARIANCE,
+    UNKNOWN_VARIANCE,
+)
 
 from .headers import (
     head_of,
@@ -63,9 +66,6 @@ from .headers import (
 )
 
 Place = TypeVar('Place', Fix, Start)
-
-LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e16
-"""Limits of the variance of a fix, m^2: a micrometre and 100,000 km squared."""
 
 
 def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
@@ -84,7 +84,6 @@ def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
         position=(x, y, z if np.isfinite(z) else 0.0),
         covariance=covariance,
     )
-    check_size(fix)
     return to_enu(fix, world_frame, _turned)
 
 
@@ -103,7 +102,6 @@ def read_start(message: Any, *, world_frame: str = 'enu') -> Start:
         position=(float(point.x), float(point.y), float(point.z)),
         covariance=covariance,
     )
-    check_size(start, 'start')
     return to_enu(start, world_frame, _turned)
 
 
@@ -114,16 +112,9 @@ def _turned(fix: Place) -> Place:
 
 
 def check_size(fix: Fix | Start, what: str = 'fix') -> None:
-    """Raise `Rejection` for a covariance so small or large that arithmetic with it breaks down."""
-    if fix.covariance is None or np.isnan(fix.covariance[0, 0]):
-        return
-    least, most = np.linalg.eigvalsh(fix.covariance[:2, :2])
-    if least < LEAST_VARIANCE or most > MOST_VARIANCE:
-        raise Rejection(
-            'out_of_range',
-            f'the {what} states a standard deviation from '
-            f'{np.sqrt(least):g} m to {np.sqrt(most):g} m',
-        )
+    """Raise `Rejection` for a covariance of x and y that no message may state."""
+    if fix.covariance is not None and not np.isnan(fix.covariance[0, 0]):
+        check_flat(fix.covariance[:2, :2], f'the {what}')
 
 
 def doubt_fix(message: Any) -> str | None:
@@ -186,8 +177,8 @@ def known_covariance(message: Any) -> NDArray[np.float64] | None:
     if covariance is None:
         return None
     block = covariance[:2, :2]
-    if _is_stated(block):
-        check_covariance(block, 'a fix')
+    if is_stated(block):
+        check_flat(block, 'a fix')
         return covariance
     covariance[:2], covariance[:, :2] = np.nan, np.nan
     stated = 0.0 < covariance[2, 2] < UNKNOWN_VARIANCE
@@ -333,15 +324,12 @@ def _in_axes(
 
 
 def _stated(values: Any) -> np.ndarray | None:
-    """The part of x y z (3, 3); None when it is unknown, see `_is_stated`."""
+    """The part of x y z (3, 3); None when it is unknown. Raises `Rejection` as of a fix."""
     block = square(values, 6)[:3, :3]
-    return block if _is_stated(block) else None
-
-
-def _is_stated(block: NDArray[np.float64]) -> bool:
-    """Whether a covariance is stated. Drivers say that it is not by numbers that are not finite,
-    negative on the diagonal, or all zero."""
-    return bool(np.isfinite(block).all() and block.any() and (np.diag(block) >= 0.0).all())
+    if not is_stated(block):
+        return None
+    check_flat(block[:2, :2], 'a relative position')
+    return block
 
 
 # -- in latitude and longitude -----------------------------------------------------------------
@@ -455,17 +443,14 @@ def _on_earth(message: Any) -> np.ndarray | None:
     covariance = square(values, n, 'covariance')[:3, :3]
     if kind == DIAGONAL:
         covariance = np.diag(np.diag(covariance))
-    usable = np.isfinite(covariance[:2, :2]).all() and (np.diag(covariance) >= 0.0)[:2].all()
-    if not usable or not covariance.any():
+    if not is_stated(covariance[:2, :2]):
         return None
-    if not np.isfinite(covariance[2]).all() or covariance[2, 2] < 0.0:
+    check_flat(covariance[:2, :2], 'the position')
+    of_z = covariance[2, 2]
+    if not (np.isfinite(covariance[2]).all() and LEAST_VARIANCE <= of_z < UNKNOWN_VARIANCE):
+        # No height: say so, rather than that it is certain.
         covariance[2] = covariance[:, 2] = 0.0
-    if not covariance[2].any():  # no height: say so, rather than that it is certain
-        covariance = covariance + np.diag([0.0, 0.0, UNKNOWN_VARIANCE])
-    if (np.abs(covariance) <= MOST_VARIANCE).all():
-        least = float(np.linalg.eigvalsh(0.5 * (covariance + covariance.T))[0])
-        if least < LEAST_VARIANCE:
-            raise Rejection('out_of_range', f'the position states a variance of {least:g} m^2')
+        covariance[2, 2] = UNKNOWN_VARIANCE
     return covariance
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from sonar_imm.acoustics.geometry import flip_quaternion
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Altitude, Navigation, Rejection, VesselHeading, VesselPose
+from sonar_imm.measurements.variances import by_axis
 
 from .headers import (
     head_of,
@@ -197,15 +198,18 @@ def _vector(value: Any) -> tuple[float, float, float]:
 
 
 def _covariance(values: Any) -> FloatArray | None:
-    """(6, 6), or None when it is all zero, negative on the diagonal, or not numbers: unknown."""
-    matrix = square(values, 6, 'covariance of the navigation')
-    diagonal = np.diag(matrix)
-    usable = np.isfinite(matrix).all() and matrix.any() and (diagonal >= 0.0).all()
-    return matrix if usable else None
+    """(6, 6), NaN in rows and columns of what is unknown, or None when all is."""
+    return by_axis(square(values, 6, 'covariance of the navigation'))
 
 
 def _written(covariance: FloatArray | None) -> FloatArray:
-    return np.diag(np.full(6, -1.0)) if covariance is None else covariance
+    """(6, 6) of a message, whose unknown variances are -1."""
+    if covariance is None:
+        return np.diag(np.full(6, -1.0))
+    unknown = np.isnan(np.diag(covariance))
+    written = np.nan_to_num(covariance)
+    written[unknown, unknown] = -1.0
+    return written
 
 
 # -- the pose of a vessel that carries a transceiver -------------------------------------------
@@ -227,8 +231,7 @@ def read_heading(message: Any, *, world_frame: str = 'enu', **_: Any) -> VesselH
         given = square(message.orientation_covariance, 3, 'covariance of an orientation')
         if given[0, 0] == -1.0:
             raise Rejection('no_orientation', 'the IMU says that it has no orientation')
-        usable = np.isfinite(given).all() and (np.diag(given) > 0.0).all()
-        covariance = given if usable else None
+        covariance = by_axis(given)
     q = message.orientation if hasattr(message, 'orientation') else message.quaternion
     heading = VesselHeading(
         **head_of(message),
@@ -240,12 +243,17 @@ def read_heading(message: Any, *, world_frame: str = 'enu', **_: Any) -> VesselH
 
 def write_heading(heading: VesselHeading, make: Make) -> Any:
     """Write a sensor_msgs/Imu with an orientation and nothing else."""
-    covariance = np.zeros(9) if heading.covariance is None else np.ravel(heading.covariance)
+    covariance = np.zeros((3, 3))
+    if heading.covariance is not None:
+        unknown = np.isnan(np.diag(heading.covariance))
+        covariance = np.nan_to_num(heading.covariance)
+        # A first number of -1 says that there is no orientation.
+        covariance[unknown, unknown] = np.nan
     return make(
         'sensor_msgs/msg/Imu',
         header=make_header(heading.stamp_ns, heading.frame_id, make),
         orientation=make_vector(heading.orientation, make, 'Quaternion'),
-        orientation_covariance=covariance,
+        orientation_covariance=np.ravel(covariance),
         angular_velocity_covariance=np.array([-1.0] + [0.0] * 8),
         linear_acceleration_covariance=np.array([-1.0] + [0.0] * 8),
     )

@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_imm.measurements import Fixes, NOBODY, Rejection, usable_fixes
+from sonar_imm.measurements.variances import LEAST_VARIANCE, MOST_VARIANCE, UNKNOWN_VARIANCE
 
-from .fixes import LEAST_VARIANCE, MOST_VARIANCE
 from .headers import (
     head_of,
     Make,
@@ -158,13 +158,14 @@ def _turned(scan: Fixes) -> Fixes:
 
 
 def _sized(covariance: NDArray | None, rows: int) -> NDArray[np.bool_]:
-    """Which covariances (n,) are neither so small nor so large that arithmetic breaks down. Those
-    of x and y that are said to be unknown become NaN."""
+    """Which covariances (n,) can be used, as `measurements.variances` says of one. Those of x and
+    y that are said to be unknown become NaN."""
     if covariance is None:
         return np.ones(rows, bool)
     variance = covariance[:, (0, 1), (0, 1)]
     with np.errstate(invalid='ignore'):
         sized = ((variance >= LEAST_VARIANCE) & (variance <= MOST_VARIANCE)).all(axis=1)
+        sized &= (variance < UNKNOWN_VARIANCE).any(axis=1)
         if not sized.all():
             flat = covariance[:, :2, :2]
             unknown = ~(variance >= 0.0).all(axis=1) | ~flat.any(axis=(1, 2))

@@ -455,12 +455,11 @@ def _(ping: Arrivals, pose: Pose) -> Arrivals:
 
 @_moved.register
 def _(navigation: Navigation, pose: Pose) -> Navigation:
-    covariance, turn = navigation.pose_covariance, np.kron(np.eye(2), pose.R)
     return evolve(
         navigation,
         position=_placed(navigation.position, pose),
         orientation=_after(geometry.euler_angles(pose.R)[2], navigation.orientation),
-        pose_covariance=None if covariance is None else turn @ covariance @ turn.T,
+        pose_covariance=_turned_pose(navigation.pose_covariance, pose),
     )
 
 
@@ -511,6 +510,18 @@ def _turned(covariance: FloatArray, pose: Pose) -> FloatArray:
     turned[..., :2, :2] = R @ covariance[..., :2, :2] @ R.T
     turned[..., :2, 2] = covariance[..., :2, 2] @ R.T
     turned[..., 2, :2] = turned[..., :2, 2]
+    return np.asarray(turned)
+
+
+def _turned_pose(covariance: FloatArray | None, pose: Pose) -> FloatArray | None:
+    """(6, 6) of a pose turned about the vertical, which mixes x with y, and roll with pitch: where
+    one is unknown (NaN), both are."""
+    if covariance is None:
+        return None
+    turn, unknown = np.kron(np.eye(2), pose.R), np.isnan(np.diag(covariance))
+    unknown[[0, 1]], unknown[[3, 4]] = unknown[:2].any(), unknown[3:5].any()
+    turned = turn @ np.where(unknown | unknown[:, None], 0.0, covariance) @ turn.T
+    turned[unknown], turned[:, unknown] = np.nan, np.nan
     return np.asarray(turned)
 
 

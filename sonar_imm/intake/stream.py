@@ -240,12 +240,16 @@ class ReplayStream(Stream, Generic[State]):
         """The state before the oldest scan that is kept."""
         return self._history.base
 
+    def forget(self) -> None:
+        """Forget all measurements, but for what survives of the state."""
+        self._history = ReplayHistory(self._survivor(self.state), self._rules.window_ns)
+
     def revise(self, measurement: Any) -> list[tuple[int, State]]:
         """Take a measurement in: every stamp with a new or a changed state, and that state, oldest
         first."""
         admitted = self.admit(measurement)
         if admitted.restarted:
-            self._history = ReplayHistory(self._survivor(self.state), self._rules.window_ns)
+            self.forget()
         revised: dict[int, State] = {}
         for item in admitted.items:
             newest_ns = self._history.newest_ns

@@ -27,6 +27,7 @@ from .checks import (
     points,
     Rejection,
 )
+from .variances import LEAST_VARIANCE, UNKNOWN_VARIANCE
 
 
 def _ids(value: Any) -> NDArray[np.uint16]:
@@ -40,12 +41,6 @@ NOBODY = -1
 
 FARTHEST_FIX = 1e8
 """Most metres of a fix from the origin on each axis."""
-
-UNKNOWN_VARIANCE = 1e6
-"""Variance, m^2, that senders write for what they do not know: from it on z is not stated."""
-
-LEAST_VARIANCE = 1e-12
-"""Least variance of z, m^2, that can be meant."""
 
 LEAST_REST = 1e-9
 """Least share of the variance of z that may be left when x and y are known."""

@@ -31,11 +31,10 @@ from .checks import (
 )
 from .diver import NOBODY
 from .obstacle import Navigation
+from .variances import MOST_VARIANCE, UNMEASURED_ANGLE
 
 FARTHEST_OFFSET = 1e5
 """Most metres from a transceiver to what it has located."""
-MOST_VARIANCE = 1e16
-"""Square metres; arithmetic with more breaks down."""
 
 
 def _symmetric(covariance: FloatArray | None, what: str) -> FloatArray | None:
@@ -109,7 +108,8 @@ class VesselPose(Navigation):
 @frozen(eq=False, kw_only=True)
 class VesselHeading:
     """How the vessel lies: orientation (4,) quaternion x, y, z, w, ENU from FLU; covariance (3, 3)
-    of a rotation vector in the world, rad^2, or None."""
+    of a rotation vector in the world, rad^2, NaN in row and column of an axis that is unknown, or
+    None."""
 
     FRAME: ClassVar[str] = 'none'
 
@@ -128,7 +128,13 @@ class VesselHeading:
                 'bad_orientation',
                 f'the orientation is a quaternion of length {length:.3g}, not 1',
             )
-        object.__setattr__(self, 'covariance', _symmetric(self.covariance, 'an orientation'))
+        if self.covariance is not None:
+            given = floats(self.covariance, 3, 3)
+            variance = np.diag(given)
+            known = (variance > 0.0) & (variance <= UNMEASURED_ANGLE)
+            if known.any():
+                check_covariance(given[np.ix_(known, known)], 'an orientation')
+            object.__setattr__(self, 'covariance', given)
 
     def key(self) -> bytes:
         """See `content_key`."""

@@ -54,6 +54,7 @@ _LEAST_OFFSET = 0.5
 UNUSED_REASONS = frozenset(
     {
         'doubted',
+        'far_from_origin',
         'full',
         'heading_unmeasured',
         'navigation_gap',
@@ -61,6 +62,7 @@ UNUSED_REASONS = frozenset(
         'no_origin',
         'other_depths',
         'other_frame',
+        'position_unmeasured',
         'too_late',
         'unknown_type',
         'vessel_pose_gap',

@@ -166,9 +166,25 @@ def _click_option(
     )
 
 
+class _SpeedOfSound(click.FloatRange):
+    """A speed of sound, m/s: a number, or a file with a profile, of which the mean is taken."""
+
+    name = 'm/s or FILE'
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        path = Path(str(value))
+        if isinstance(value, str) and path.is_file():
+            from ..recordings.sound_speed import mean_speed, read_profile
+
+            value = round(mean_speed(read_profile(path)), 3)
+        return super().convert(value, param, ctx)
+
+
 def _click_type(spec: Option) -> Any:
     if spec.choices:
         return click.Choice(spec.choices)
+    if spec.kind == 'speed':
+        return _SpeedOfSound(*spec.range)
     if spec.kind not in ('float', 'int'):
         return FILE if spec.kind == 'file' else str
     low, high = spec.range

@@ -183,6 +183,9 @@ class NmeaOptions(_WithTruth):
     own: str = option('auto', '',
         'What the positions of the receiver itself are; auto: of the vessel, where there are '
         'targets, else the fixes.', choices=('auto', 'vessel', 'fixes'))
+    talker: str = option('', 'GP|GN|...',
+        'Whose positions of the receiver itself are used, where several talkers say them; by '
+        'default of the one that says most.')
 
 
 @frozen(kw_only=True)
@@ -222,8 +225,8 @@ class DetectionsOptions(_Receivers):
         'Time over which the clock of a receiver drifts evenly.', kind='float',
         range=(0.1, 1e4))
     sound_speed: float = option(1500.0, '',
-        'Speed of sound in m/s, for the travel times from fixed tags.', kind='float',
-        range=(1300.0, 1700.0))
+        'Speed of sound in m/s, or a file with its profile, for the travel times from fixed tags.',
+        kind='speed', range=(1300.0, 1700.0))
     toa_std: float | None = option(None, 'SECONDS',
         'Standard deviation of arrival times; by default that of the clocks after --sync.',
         kind='float', above=0.0)
@@ -303,8 +306,8 @@ class InterferometerOptions(_Options):
     radians_per_count: float | None = _phase_scale()
     element_spacing: float | None = _element_spacing()
     sound_speed: float = option(1500.0, '',
-        'Speed of sound in m/s, where a message states none.', kind='float',
-        range=(1300.0, 1700.0))
+        'Speed of sound in m/s, or a file with its profile, where a message states none.',
+        kind='speed', range=(1300.0, 1700.0))
     order: str = option('range_major', '',
         'Order of the samples in an image with several channels.',
         choices=('range_major', 'beam_major'))
@@ -361,8 +364,9 @@ class SegyOptions(_Navigated):
         'Depth from sample to sample; by default from the sample interval.', kind='float',
         above=0.0)
     sound_speed: float = option(1500.0, '',
-        'Speed of sound in m/s, for the sample interval and the recording delay.', kind='float',
-        range=(1300.0, 1700.0))
+        'Speed of sound in m/s, or a file with its profile, for the sample interval and the '
+        'recording delay.',
+        kind='speed', range=(1300.0, 1700.0))
     first_sample: int = option(0, '',
         'Leave out samples before it, e.g. the transmit pulse.', kind='int', range=(0, None))
     samples: int | None = option(None, '',

@@ -33,7 +33,8 @@ class Option:
 
     metavar: what the help page shows for its value; empty for the name of the type. flag: its
     spelling where that is not the name of the field. kind: ``text``, ``float``, ``int``, ``file``,
-    or ``pairs`` for NAME=VALUE, which may be repeated. range: of a number, inclusive; above: a
+    ``speed`` for that of sound, a number or a file with a profile, or ``pairs`` for NAME=VALUE,
+    which may be repeated. range: of a number, inclusive; above: a
     limit it has to exceed. parse: from the text to the value; raises ValueError with a sentence.
     many: may be repeated.
     """

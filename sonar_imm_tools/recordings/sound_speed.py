@@ -125,7 +125,10 @@ def _columns(path: Path, names: list[str]) -> tuple[int, int]:
     depth, speed = find(DEPTH_NAMES), find(SPEED_NAMES)
     if depth is None or speed is None:
         missing = 'depth' if depth is None else 'sound speed'
-        raise BagError(f'{path} has no column of {missing}; it has {", ".join(names[:12])}')
+        own = ', '.join(name[:20] for name in names[:12])
+        raise BagError(
+            f'{path} is no profile of sound speed: it has no column of {missing}; it has {own}'
+        )
     return depth, speed
 
 

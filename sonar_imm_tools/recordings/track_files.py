@@ -14,8 +14,11 @@ from contextlib import suppress
 import json
 import math
 from pathlib import Path
+import re
 from typing import Any
 from xml.etree import ElementTree
+
+import numpy as np
 
 from .csv_table import CsvTable
 from .sources import BagError, start_of
@@ -173,15 +176,21 @@ def _read_geojson(path: Path) -> Iterator[dict[str, str] | str]:
     except (ValueError, RecursionError) as error:
         begin = text.find('[', text.find('"features"')) + 1
         whole, damage = {'features': whole_items(text, begin)}, f'is damaged JSON: {error}'
+        if named := _CRS.search(text[:begin]):
+            whole['crs'] = {'properties': {'name': named[1]}}
     features = whole.get('features') if isinstance(whole, dict) else None
+    parts = []
     for feature in features if isinstance(features, list) else [whole]:
         if not isinstance(feature, dict):
             continue
         geometry, found = feature.get('geometry') or {}, feature.get('properties') or {}
-        if not isinstance(geometry, dict) or not isinstance(found, dict):
-            continue
+        if isinstance(geometry, dict) and isinstance(found, dict):
+            parts.append((found, _places_of(geometry)))
+    if (epsg := _crs_of(path, whole)) is not None:
+        _to_degrees([place for _, places in parts for place in places], epsg)
+    for found, places in parts:
         cells = {str(name): _cell(value) for name, value in found.items()}
-        places, times = _places_of(geometry), _times_of(found)
+        times = _times_of(found)
         for number, place in enumerate(places):
             row = dict(zip(('longitude', 'latitude', 'height'), map(_cell, place)))
             if len(times) == len(places):
@@ -189,6 +198,40 @@ def _read_geojson(path: Path) -> Iterator[dict[str, str] | str]:
             yield cells | row
     if damage:
         yield damage
+
+
+_CRS = re.compile(r'"crs".{0,80}?"name"\s*:\s*"((?!name")[^"]*)"', re.DOTALL)
+"""The name of the coordinate system at the head of a file."""
+
+
+def _crs_of(path: Path, whole: Any) -> int | None:
+    """The EPSG number of a member ``crs``, as GeoJSON had it until 2016 and GIS programs still
+    write it; None for longitude and latitude. Raises `BagError` for one that is not known."""
+    crs = whole.get('crs') if isinstance(whole, dict) else None
+    about = crs.get('properties') if isinstance(crs, dict) else None
+    name = str(about.get('name', '') if isinstance(about, dict) else '')
+    if not name or 'CRS84' in name.upper():
+        return None
+    numbers = re.search(r'EPSG.*?(\d+)$', name.upper())
+    if numbers is None:
+        raise BagError(
+            f"{path} is in the coordinate system '{name}', which is not known; write it with "
+            'longitude and latitude (EPSG:4326)'
+        )
+    return None if int(numbers[1]) == 4326 else int(numbers[1])
+
+
+def _to_degrees(places: list[Any], epsg: int) -> None:
+    """Write longitude and latitude into places of a coordinate system. Raises `BagError`."""
+    from .export.points import degrees_of
+
+    numbers = [
+        [value if isinstance(value, (int, float)) else math.nan for value in place[:2]]
+        for place in places
+    ]
+    degrees = degrees_of(np.array(numbers, np.float64).reshape(-1, 2), epsg)
+    for place, longitude, latitude in zip(places, *degrees):
+        place[0], place[1] = float(longitude), float(latitude)
 
 
 def whole_items(text: str, at: int) -> list[Any]:

@@ -25,6 +25,8 @@ import numpy as np
 import pytest
 
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.reader import BagReader
 
 TEST = Path(__file__).resolve().parents[1]
 ELSEWHERE = [
@@ -49,7 +51,6 @@ ELSEWHERE = [
         'recordings/convert/test_nmea.py',
         'the_date_is_advised_only_where_it_helps',
     ),
-    ('german_headers', 'recordings/test_columns.py', 'headers_in_six_languages'),
     ('hemispheres', 'recordings/test_columns.py', 'degrees_in_every_spelling'),
     ('hhmmss', 'recordings/test_times.py', 'times_of_day_in_one_number_pass_minutes_and_hours'),
     (
@@ -59,17 +60,6 @@ ELSEWHERE = [
     ),
     ('matlab_dates', 'recordings/test_times.py', 'forms_of_dates_and_times'),
     ('zero_zero (target)', 'msg_adapters/test_fixes.py', 'latitude_0_longitude_0_is_no_fix'),
-    (
-        'slow_scan',
-        'msg_adapters/test_detections.py',
-        'the_rays_of_a_laser_scan_have_times_and_its_stamp_is_the_last_one',
-    ),
-    ('picture_of_the_fan', 'msg_adapters/test_fans.py', 'a_fan_gives_ranges_by_beams'),
-    (
-        'image_and_odometry',
-        'cli/test_frames.py',
-        'the_only_odometry_beside_detections_is_found_by_its_type',
-    ),
     ('unknown_usbl_type', 'cli/test_info.py', 'a_type_that_nobody_hears_names_what_would_do'),
     ('folder_not_utf8', 'cli/test_names.py', 'any_locale_will_do'),
     (
@@ -77,7 +67,7 @@ ELSEWHERE = [
         'cli/test_stranger.py',
         'a_recording_keeps_no_files_and_changes_no_node',
     ),
-    ('hostile_state', 'trackers/test_state.py', 'the_file_is_named_arrays_and_json'),
+    ('hostile_state', 'trackers/test_hostile_state.py', 'a_file_runs_no_program'),
     ('endless_coverage', 'cli/test_stranger.py', 'a_file_that_a_recording_names_lies_beside_it'),
     ('segy_delay', 'recordings/convert/test_segy_headers.py', 'the_recording_delay_of_each_trace'),
     (
@@ -131,6 +121,8 @@ ELSEWHERE = [
 TELEMETRY = 'convert detections detections.csv b --receivers receivers.csv --time-zone UTC'
 FISH = 'track b run --set target=fish --set target_z=-3.0'
 FIXES = 'convert fixes fixes.csv b'
+PLACES = ('place_cov_x_x', 'place_cov_x_y', 'place_cov_x_y', 'place_cov_y_y')
+"""Columns of the covariance of an obstacle."""
 ONE = 'track b run --set target=rov --set max_tracks=1'
 
 
@@ -273,6 +265,75 @@ def commas(folder):
     (folder / 'fixes.csv').write_text('\n'.join(['\ufeff"time","x","y"', *rows]) + '\n', 'utf-8')
 
 
+def flagged(folder):
+    """A German table in the letters of Windows, of which every tenth row is bad and 60 m off."""
+    rng, rows = np.random.default_rng(11), []
+    for k in range(200):
+        bad = k % 10 == 5
+        x, y = made.swim(2 * k) + rng.normal(size=2) + (60 if bad else 0)
+        latitude, longitude, _ = made.PLACE.geodetic(np.array([x, y, 0.0]))
+        cells = f'{latitude:.7f};{longitude:.7f};1.0'.replace('.', ',')
+        rows.append(
+            f'{TEXT(made.BEGIN + 2 * k, 0, "%d.%m.%Y %H:%M:%S")};Müller;{cells};'
+            f'{"Fehler" if bad else "OK"}'
+        )
+    head = 'Zeitstempel;Name;Breitengrad;Längengrad;Standardabweichung [m];Status'
+    (folder / 'taucher.csv').write_text('\n'.join([head, *rows]) + '\n', 'cp1252')
+
+
+def are_the_good_ones(run):
+    """180 fixes of 1 m, all within 8 m of the way."""
+    with BagReader('b') as bag:
+        scans = [item.measurement for item in measurements_of(bag, 'diver', {'/fixes': 'fixes'})]
+    places = np.concatenate([scan.position[:, :2] for scan in scans])
+    way = np.array([made.swim(1e-9 * scan.stamp_ns - made.BEGIN) for scan in scans])
+    away = np.linalg.norm(places - places[0] - way + way[0], axis=1)
+    variances = {float(scan.covariance[0, 0, 0]) for scan in scans}
+    return len(scans) == 180 and away.max() < 8.0 and variances == {1.0} and '20' in run.words
+
+
+def knows_the_obstacle(run):
+    """Within 1 m at the end."""
+    last = run.place[run.t == run.t[-1]]
+    return np.linalg.norm(last - made.OBSTACLE, axis=1).min() < 1.0
+
+
+def profile(folder):
+    """60 traces of a flat floor at 12 m, 30 dB over a noisy water column, and two layers."""
+    segyio = pytest.importorskip('segyio')
+    words, spec, rng = segyio.TraceField, segyio.spec(), np.random.default_rng(12)
+    spec.format, spec.samples, spec.tracecount = 5, np.arange(600) * 0.06, 60
+    t = np.arange(600) * 60e-6
+    layers = sum(
+        a * np.exp(-0.5 * ((t - at) / 2e-4) ** 2)
+        for at, a in ((0.016, 1000.0), (0.021, 500.0), (0.029, 300.0))
+    )
+    with segyio.create(str(folder / 'line.sgy'), spec) as file:
+        file.bin.update({3217: 60, 3221: 600})
+        for k in range(60):
+            file.trace[k] = (layers + rng.rayleigh(30.0, 600)).astype(np.float32)
+            file.header[k] = {
+                words.TRACE_SAMPLE_INTERVAL: 60, words.TRACE_SAMPLE_COUNT: 600,
+                words.YearDataRecorded: 2021, words.DayOfYear: 60, words.HourOfDay: 10,
+                words.MinuteOfHour: k // 240, words.SecondOfMinute: k // 4 % 60,
+            }  # fmt: skip
+
+
+def has_no_ghosts(run):
+    """No horizon more than 1 m above the floor in 5 % of the traces; the floor itself in 90 %."""
+    with open('run/estimate.csv') as file:
+        rows = list(csv.DictReader(file))
+    traces = {row['stamp_ns'] for row in rows}
+    surely = [row for row in rows if float(row['existence']) > 0.5]
+    above = {row['stamp_ns'] for row in surely if float(row['depth']) < 11.0}
+    floor = {
+        row['stamp_ns']
+        for row in surely
+        if abs(float(row['depth']) - 12.0) < 0.4 and float(row['is_bottom']) > 0.9
+    }
+    return len(traces) > 50 and len(above) < 3 and len(floor) > 54
+
+
 def attitude(*variances):
     return lambda folder: made.by_vessel(folder / 'b', made.odometry(variances))
 
@@ -322,6 +383,20 @@ CASES = [
          ('track b run',), lambda run: len(run.t) > 55 and len(set(run.track)) == 1
          and np.linalg.norm(run.errors(made.seen_from), axis=1).max() < 7.0
          and 'no_fix' in run.words),
+    Case('german_headers', flagged, ('convert fixes taucher.csv b --time-zone UTC',),
+         are_the_good_ones),
+    *(Case(f'slow_scan {sweep} {turning}', lambda folder, sweep=sweep, turning=turning:
+           made.slow_scan(folder / 'b', sweep, turning),
+           ('track b run --system obstacle --topic detections=/scan --topic nav=/odom',),
+           knows_the_obstacle) for sweep, turning in ((7.0, 0.0), (11.0, 0.6))),
+    *(Case(f'picture_of_the_fan {sector}', lambda folder, sector=sector:
+           made.pictures(folder / 'b', sector), ('track b run --system obstacle --topic nav=/odom '
+           f'--topic image=/sonar/image --set image_far_range=40.0 --set image_fov_deg={sector}',),
+           knows_the_obstacle) for sector in (70.0, 120.0)),
+    Case('image_and_odometry', lambda folder: made.pictures(folder / 'b', 90.0),
+         ('track b run --system obstacle --set image_far_range=40.0 --set image_fov_deg=90.0',),
+         knows_the_obstacle),
+    Case('ghost_line', profile, ('convert segy line.sgy b', 'track b run'), has_no_ghosts),
 ]  # fmt: skip
 
 
@@ -334,7 +409,8 @@ def test_a_case_is_right_or_asked(case, tmp_path, monkeypatch, capsys):
     rows = []
     if (table := tmp_path / 'run' / 'estimate.csv').exists():
         with table.open() as file:
-            rows = [row for row in csv.DictReader(file) if row['track_state'] in ('1', '2')]
+            rows = [row for row in csv.DictReader(file) if row.get('track_state') in ('1', '2')]
+    columns = ('cov_px_px', 'cov_px_py', 'cov_px_py', 'cov_py_py')
     run = Run(
         codes,
         printed.out + printed.err,
@@ -342,7 +418,7 @@ def test_a_case_is_right_or_asked(case, tmp_path, monkeypatch, capsys):
         np.array([[float(row['px']), float(row['py'])] for row in rows]).reshape(-1, 2),
         np.array(
             [
-                [float(row[f'cov_{name}']) for name in ('px_px', 'px_py', 'px_py', 'py_py')]
+                [float(row[name]) for name in (columns if columns[0] in row else PLACES)]
                 for row in rows
             ]
         ).reshape(-1, 2, 2),

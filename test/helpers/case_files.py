@@ -17,7 +17,14 @@ import numpy as np
 from msg_adapters.fixes import write_fix, write_geodetic, write_relative
 from msg_adapters.navigation import write_heading, write_navigation
 from sonar_imm.acoustics.geodesy import Origin
-from sonar_imm.measurements import Fix, RelativeFix, VesselFix, VesselHeading, VesselPose
+from sonar_imm.measurements import (
+    Fix,
+    Navigation,
+    RelativeFix,
+    VesselFix,
+    VesselHeading,
+    VesselPose,
+)
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.writer import BagWriter
 
@@ -152,3 +159,85 @@ def satellite(every):
         bag.write('/heading', write_heading(heading, ros_message), ns(k))
 
     return nav
+
+
+OBSTACLE = np.array([22.0, 4.0])
+"""In the frame of the odometry, m."""
+
+
+def swim_past(bag, seconds, turning=0.0):
+    """/odom at 10 Hz of a vehicle at .5 m/s that looks to and fro by `turning`, rad; gives where
+    it sees the obstacle at t: range and bearing."""
+
+    def pose(t):
+        return 0.5 * t, turning * math.sin(t / 8)
+
+    for k in range(10 * seconds):
+        x, yaw = pose(k / 10)
+        odometry = Navigation(
+            stamp_ns=ns(k / 10),
+            position=(x, 0.0, -5.0),
+            orientation=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
+            velocity=(0.5 * math.cos(yaw), -0.5 * math.sin(yaw), 0.0),
+            turn_rate=(0.0, 0.0, turning / 8 * math.cos(k / 80)),
+            frame_id='odom',
+            child_frame_id='base_link',
+        )
+        bag.write('/odom', write_navigation(odometry, ros_message), ns(k / 10))
+
+    def seen(t):
+        x, yaw = pose(t)
+        dx, dy = OBSTACLE - [x, 0.0]
+        return math.hypot(dx, dy), math.remainder(math.atan2(dy, dx) - yaw, 2 * math.pi)
+
+    return seen
+
+
+def slow_scan(path, sweep, turning, beams=360, seed=18):
+    """A bag of a sonar that turns once in `sweep` s: a LaserScan stamped at its first beam."""
+    rng, step = np.random.default_rng(seed), 2 * math.pi / beams
+    with BagWriter(path) as bag:
+        seen, t = swim_past(bag, 90, turning), 0.2
+        while t + sweep < 89:
+            ranges = np.full(beams, np.inf, np.float32)
+            for k in range(beams):
+                distance, bearing = seen(t + k / beams * sweep)
+                if abs(bearing + math.pi - k * step) < step / 2:
+                    ranges[k] = distance + 0.1 * rng.normal()
+            scan = ros_message(
+                'sensor_msgs/msg/LaserScan', header=header(t, 'sonar'), angle_min=-math.pi,
+                angle_max=math.pi - step, angle_increment=step, time_increment=sweep / beams,
+                scan_time=sweep, range_min=0.75, range_max=50.0, ranges=ranges,
+                intensities=np.where(np.isinf(ranges), 0, 200).astype(np.float32),
+            )  # fmt: skip
+            bag.write('/scan', scan, ns(t + sweep))
+            t += sweep
+
+
+def pictures(path, sector_deg, seconds=20, rows=160, far=40.0, seed=19):
+    """A bag of pictures at 2 Hz of a sonar's fan as on a screen, whose lower corners are dark."""
+    rng, half = np.random.default_rng(seed), math.radians(sector_deg / 2)
+    width = int(2 * rows * math.sin(half))
+    v, u = np.mgrid[:rows, :width]
+    ahead, port = (rows - v) / rows * far, (width / 2 - u) / rows * far
+    dark = (np.hypot(ahead, port) > far) | (abs(np.arctan2(port, ahead)) > half)
+    with BagWriter(path) as bag:
+        seen = swim_past(bag, seconds)
+        for k in range(2 * seconds):
+            distance, bearing = seen(k / 2)
+            away = np.hypot(
+                ahead - distance * math.cos(bearing), port - distance * math.sin(bearing)
+            )
+            pixels = rng.rayleigh(12, dark.shape) + 230 * np.exp(-((away / 0.4) ** 2))
+            image = ros_message(
+                'sensor_msgs/msg/Image', header=header(k / 2, 'sonar'), height=rows, width=width,
+                encoding='mono8', is_bigendian=0, step=width,
+                data=np.clip(np.where(dark, 0, pixels), 0, 255).astype(np.uint8).ravel(),
+            )  # fmt: skip
+            bag.write('/sonar/image', image, ns(k / 2))
+
+
+def header(t, frame_id):
+    seconds, nanoseconds = divmod(ns(t), 10**9)
+    stamp = ros_message('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds)
+    return ros_message('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)

@@ -22,7 +22,8 @@ of their scan here, so that those who are not looked at just now are not missed.
 
 Without a stated origin the first position in latitude and longitude is it, once such a position is
 used. Then metres that others have measured are from somewhere else, and cannot be used beside it:
-what came first stays.
+what came first stays. Positions far from it are refused, unless it is the first ones that are
+wrong: a receiver that has just been switched on may be anywhere.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ from ...measurements import (
     VesselHeading,
     VesselPose,
 )
+from ...measurements.variances import filled, UNKNOWN_VARIANCE, UNMEASURED_ANGLE
 from ..navigation import MOST_WAITING, NavigationBuffer, Readiness
 from .config import DiverConfig
 
@@ -62,9 +64,11 @@ KEPT_NS = 60_000_000_000
 """Poses are kept that long, and for the history of the tracker."""
 _LONGEST_PAUSE_NS = 3_600_000_000_000
 _RESTART_AFTER = 5
-UNMEASURED = 0.3
-"""Variance of an angle, rad^2, above which it is not measured: drivers write pi^2, 99 or 1e6. The
-composition of positions is an expansion that does not hold there."""
+FARTHEST = 1e6
+"""Metres from the origin. Further away a plane that touches the Earth there is no chart: lengths
+are wrong by more than a hundredth."""
+_AGREE = 3
+"""Positions in succession, as far from an origin that fewer have confirmed, that are believed."""
 _LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -120,6 +124,9 @@ class Georeferencer:
     STATE: ClassVar = (
         'origin',
         '_first',
+        '_near',
+        '_away',
+        '_agree',
         '_metric',
         '_poses',
         '_places',
@@ -131,6 +138,9 @@ class Georeferencer:
     _counts: Counter[str]
     origin: Origin | None = field(init=False)
     _first: Origin | None = field(init=False, default=None)
+    _near: int = field(init=False, default=0)
+    _away: Origin | None = field(init=False, default=None)
+    _agree: int = field(init=False, default=0)
     _metric: bool = field(init=False, default=False)
     _poses: Samples = field(init=False)
     _places: Samples = field(init=False)
@@ -138,9 +148,12 @@ class Georeferencer:
     _waiting: list[RelativeFix] = field(init=False, factory=list)
 
     def __attrs_post_init__(self) -> None:
-        self.origin = self.config.stated_origin()
-        kept = max(KEPT_NS, nanoseconds(self.config.history))
-        self._poses, self._places, self._headings = (Samples(kept) for _ in range(3))
+        self._first = self.origin = self.config.stated_origin()
+        self._poses, self._places, self._headings = (Samples(self._kept_ns) for _ in range(3))
+
+    @property
+    def _kept_ns(self) -> int:
+        return max(KEPT_NS, nanoseconds(self.config.history))
 
     def __len__(self) -> int:
         """How many relative fixes wait for the vessel's pose."""
@@ -154,6 +167,16 @@ class Georeferencer:
                 f'{self._counts["no_origin"]} positions cannot be used: those in metres and those '
                 'in latitude and longitude need the parameter origin to stand beside each other'
             )
+        if self._counts['origin_moved']:
+            sentences.append(
+                f'the first positions lie more than {FARTHEST / 1e3:g} km from those after them: '
+                'they are taken for wrong, and the origin is that of the others'
+            )
+        elif count := self._counts['far_from_origin']:
+            sentences.append(
+                f'{count} positions lie more than {FARTHEST / 1e3:g} km from the origin and are '
+                'not used. If they are right, the parameter origin has to be near them'
+            )
         if len(self._waiting) > 1 and not self._vessel_known():
             sentences.append(
                 f'{len(self._waiting)} relative fixes wait for the pose of the vessel: nav, or '
@@ -162,13 +185,19 @@ class Georeferencer:
         if count := self._counts['heading_unmeasured']:
             sentences.append(
                 f'{count} relative fixes cannot be used: the vessel states that its heading is '
-                f'not measured (a variance above {UNMEASURED} rad^2). Give another heading, or '
-                'correct the covariance'
+                f'not measured (a variance above {UNMEASURED_ANGLE} rad^2). Give another heading, '
+                'or correct the covariance'
+            )
+        if count := self._counts['position_unmeasured']:
+            sentences.append(
+                f'{count} relative fixes cannot be used: the vessel states that its place is not '
+                f'measured (variances from {UNKNOWN_VARIANCE:g} m^2 on). Correct the covariance'
             )
         if self._counts['attitude_unmeasured']:
             sentences.append(
                 'the vessel states that roll or pitch is not measured (a variance above '
-                f'{UNMEASURED} rad^2): {self.config.vessel_attitude_std_deg:g} degrees are assumed'
+                f'{UNMEASURED_ANGLE} rad^2): {self.config.vessel_attitude_std_deg:g} degrees are '
+                'assumed'
             )
         return sentences
 
@@ -195,9 +224,8 @@ class Georeferencer:
         if isinstance(measurement, VesselHeading):
             return self._after(self._headings, _turned(measurement))
         if isinstance(measurement, GeodeticFix):
-            if self._first is None:
-                latitude, longitude = measurement.latitude, measurement.longitude
-                self._first = Origin(latitude, longitude, self.config.origin[2])
+            if not self._in_reach(measurement):
+                return []
             if isinstance(measurement, VesselFix):
                 return self._after(self._places, self._moved(measurement))
             return [self._fix_of(measurement)] if self._on_earth() else []
@@ -210,6 +238,28 @@ class Georeferencer:
         return [measurement]
 
     # -- where the origin is ---------------------------------------------------------------------
+
+    def _in_reach(self, fix: GeodeticFix) -> bool:
+        """Whether a position is near enough to the origin, which the first one is where none is
+        stated; counts a refusal. `_AGREE` others in succession move an origin that fewer
+        confirm; all that was placed by it is forgotten then (``origin_moved``)."""
+        place = Origin(fix.latitude, fix.longitude, self.config.origin[2])
+        if self._first is None:
+            self._first = place
+        if _apart(self._first, place) <= FARTHEST:
+            self._near, self._away = self._near + 1, None
+            return True
+        agrees = self._away is not None and _apart(self._away, place) <= FARTHEST
+        self._away, self._agree = place, self._agree + 1 if agrees else 1
+        unsure = self.config.stated_origin() is None and self._near < _AGREE
+        if not unsure or self._agree < _AGREE:
+            self._counts['far_from_origin'] += 1
+            return False
+        self._counts['origin_moved'] += 1
+        self._first, self._near, self._away = place, 1, None
+        self.origin = None if self.origin is None else place
+        self._places, self._waiting = Samples(self._kept_ns), []
+        return True
 
     def _in_metres(self) -> bool:
         """Whether metres can be used; counts a refusal."""
@@ -255,7 +305,7 @@ class Georeferencer:
     def _moved(self, fix: VesselFix) -> VesselPose:
         """A position of the vessel as a pose whose attitude is not meant."""
         position, covariance = self._local(fix)
-        whole = np.zeros((6, 6))
+        whole = np.full((6, 6), np.nan)
         if covariance is not None:
             whole[:3, :3] = covariance
         return VesselPose(
@@ -297,7 +347,7 @@ class Georeferencer:
                     done.append(self._composed(fix, self._vessel(fix.stamp_ns)))
                 except Rejection as error:
                     # Poses that leap within nanoseconds lead beyond the Earth.
-                    unmeasured = error.reason == 'heading_unmeasured'
+                    unmeasured = error.reason.endswith('_unmeasured')
                     self._counts[error.reason if unmeasured else 'vessel_pose_gap'] += 1
         self._waiting = waiting
         return sorted(done, key=attrgetter('stamp_ns'))
@@ -347,7 +397,7 @@ class Georeferencer:
         """Return the covariance (3, 3) of the attitude, with the assumed variance of roll or pitch
         where it is not measured. An unmeasured heading keeps its variance."""
         stated = _stated(sample, slice(3, 6), assumed)
-        level = np.diag(stated)[:2] > UNMEASURED
+        level = np.diag(stated)[:2] > UNMEASURED_ANGLE
         if level.any():
             self._counts['attitude_unmeasured'] += 1
             stated, axes = stated.copy(), np.flatnonzero(level)
@@ -368,8 +418,10 @@ class Georeferencer:
         )
         offset, covariance = fix.offset, fix.covariance
         needs_heading = not fix.levelled or mounting.lever.any()
-        if needs_heading and vessel.uncertainty.attitude[2, 2] > UNMEASURED:
+        if needs_heading and vessel.uncertainty.attitude[2, 2] > UNMEASURED_ANGLE:
             raise Rejection('heading_unmeasured', 'the heading of the vessel is not measured')
+        if (np.diag(vessel.uncertainty.position)[:2] >= UNKNOWN_VARIANCE).all():
+            raise Rejection('position_unmeasured', 'the place of the vessel is not measured')
         if fix.levelled:
             turn = vessel.axes @ self._true_north()
             offset = turn @ offset
@@ -395,9 +447,14 @@ class Georeferencer:
         )
 
 
+def _apart(one: Origin, other: Origin) -> float:
+    """The distance of two places, m, along a straight line."""
+    return float(np.linalg.norm(one.local(other.latitude, other.longitude, other.height)))
+
+
 def _turned(heading: VesselHeading) -> VesselPose:
     """An attitude of the vessel as a pose whose position is not meant."""
-    whole = np.zeros((6, 6))
+    whole = np.full((6, 6), np.nan)
     if heading.covariance is not None:
         whole[3:, 3:] = heading.covariance
     return VesselPose(
@@ -410,7 +467,5 @@ def _turned(heading: VesselHeading) -> VesselPose:
 
 def _stated(sample: Navigation, part: slice, assumed: FloatArray) -> FloatArray:
     """The part (3, 3) of a pose's covariance, where it is filled in, else what is assumed."""
-    if sample.pose_covariance is None:
-        return assumed
-    block = sample.pose_covariance[part, part]
-    return np.asarray(block if block.any() else assumed)
+    whole = sample.pose_covariance
+    return filled(None if whole is None else whole[part, part], assumed)

@@ -234,7 +234,11 @@ class DiverTracker:
     def _revise(self, measurement: Measurement) -> list[tuple[int, Known]]:
         """Return the new or changed states with their stamps, oldest first."""
         revised: dict[int, Known] = {}
-        for ready in self._georeferencer.georeference(measurement):
+        moves = self.counts['origin_moved']
+        placed = self._georeferencer.georeference(measurement)
+        if self.counts['origin_moved'] > moves:
+            self._stream.forget()
+        for ready in placed:
             revised.update(self._stream.revise(ready))
         return sorted(revised.items(), key=itemgetter(0))
 

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 import itertools
 import math
@@ -22,6 +23,7 @@ from msg_adapters.scans import write_scan
 from sonar_imm.intake import RepeatFilter
 from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 
+from ... import SECOND
 from ..columns import name_of, rank_of, UNRELATED
 from ..conversion import ask_for_units, ConversionReport, converter, Record, write_bag
 from ..convert_options import FixesOptions
@@ -35,6 +37,14 @@ from ..truth import number_names, truth_records
 
 REPEAT_TIME = 5.0
 """Seconds within which the same position is a repeated poll: the default of the tracker."""
+
+
+_UNITS = (
+    ('whole hours', 3600 * SECOND),
+    ('whole minutes', 60 * SECOND),
+    ('whole seconds', SECOND),
+)
+"""Resolutions of stamps, ns, the coarsest first."""
 
 
 @converter(FixesOptions)
@@ -154,6 +164,8 @@ def write_fixes(
             f'{len(empty)} rows have a time and no position, the first in line '
             f'{empty[0][0]}: nobody was seen then'
         )
+    if not named and (shared := _shared([fix.stamp_ns for fix in fixes])):
+        report.notes['shared stamps'] = shared
     if repeated:
         report.notes['repeated'] = (
             f'{len(repeated)} rows hold a position that came before, the first in line '
@@ -214,6 +226,22 @@ def _may_be_of_vessel(table: Table) -> bool:
 
 def _has_places(table: Table) -> bool:
     return table.has('x', 'y') or table.has('latitude', 'longitude')
+
+
+def _shared(stamps: Sequence[int]) -> str:
+    """What is said of rows without a name that share stamps; '' where few do."""
+    counts = Counter(stamps)
+    most = max(counts.values(), default=0)
+    several = sum(count for count in counts.values() if count > 1)
+    if 2 * several <= len(stamps):
+        return ''
+    step = next((unit for unit, ns in _UNITS if all(stamp % ns == 0 for stamp in counts)), '')
+    rounded = f' The stamps are {step}.' if step else ''
+    return (
+        f'up to {most} rows have one stamp: they are taken for {most} targets that are seen at '
+        f'once.{rounded} If they are of one target, their stamps lack the seconds or a fraction '
+        '(--column fraction=HEADER)'
+    )
 
 
 def _names_divers(

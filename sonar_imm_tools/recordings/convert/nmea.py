@@ -10,9 +10,9 @@
 Positions of targets are those that AIS reports (``!AIVDM``: messages 1, 2, 3, 18, 19 and 27, by
 MMSI), targets with latitude and longitude (``TLL``) and tracked targets with distance and bearing
 (``TTM``), which are placed from the vessel's last position. The vessel's own position is in
-``GGA``, ``RMC``, ``GLL`` or ``GNS``, its heading in ``HDT`` or ``THS``. Targets of the USBL of a
-vessel are in ``USRTH`` and ``PSIMSSB``, and are placed from its last position as well; how the
-vessel lies is in ``PSIMSNS``.
+``GGA``, ``RMC``, ``GLL`` or ``GNS`` of one talker, its heading in ``HDT`` or ``THS``. Targets of
+the USBL of a vessel are in ``USRTH`` and ``PSIMSSB``, and are placed from its last position as
+well; how the vessel lies is in ``PSIMSNS``.
 
 Few sentences have a whole time. In this order a time is that before the sentence (seconds since
 1970 or ISO 8601), that of its tag block (``\\c:...*hh\\``), or the vessel's clock as of the last
@@ -66,6 +66,11 @@ SENTENCE = re.compile(r'^(?P<before>.*?)(?P<sentence>[$!][A-Z]{4,8},.*?\*[0-9A-F
 USBL = ('USRTH', 'PSIMSSB', 'PSIMSNS')
 OTHER_USBL = ('PSIMLBP', 'PTSAG', 'PTSAX')
 """Sentences of targets that are not read."""
+OWN = re.compile(r'\$([A-Z]{2})(?:GGA|RMC|GLL|GNS),')
+"""A sentence with the position of the receiver itself, and its talker."""
+APART = 20.0
+"""Metres between what is said of one moment from which on it is of two receivers; two decimals of
+a minute are 18 m."""
 _CLOCK = re.compile(r'\d{6}(\.\d*)?$')
 _TAG_BLOCK = re.compile(r'\\(?:[^\\]*,)?c:(\d+)[^\\]*\\\s*$')
 
@@ -87,6 +92,12 @@ class _Log:
     unread: Counter[str] = Factory(Counter)
     hears: bool = False
     """Whether the vessel has a USBL."""
+    talker: str = ''
+    """That of the vessel's positions, where several say them."""
+    apart: list[float] = Factory(list)
+    """Metres between two positions of one moment."""
+    seen: tuple[VesselFix, str, str] | None = None
+    """The first position of the last moment, its talker and its kind of sentence."""
 
 
 @converter(NmeaOptions)
@@ -94,7 +105,7 @@ def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None
     """Convert a log of sentences to ``/fixes`` of its targets, and ``/nav_fix`` and ``/heading``
     of the vessel; where it holds no targets, the vessel's positions are the fixes.
     """
-    log = _read(path, report, how.date)
+    log = _read(path, report, how)
     as_fixes = how.own == 'fixes' or (how.own == 'auto' and not (log.targets or log.hears))
     rows, beside = log.targets, list[Record]()
     if as_fixes:
@@ -108,6 +119,7 @@ def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None
         (heading.stamp_ns, '/heading', write_heading(heading, ros_message))
         for heading in log.headings
     ]
+    _tell_receivers(log, path, report, how.talker)
     leaps = Leaps()
     leaps.saw_all(log.own)
     leaps.tell(path, report)
@@ -129,7 +141,35 @@ def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None
     report.rows = lines
 
 
-def _read(path: Path, report: ConversionReport, day: str) -> _Log:
+def _tell_receivers(log: _Log, path: Path, report: ConversionReport, chosen: str) -> None:
+    """Say that a log holds positions of several receivers. Raises `BagError` where they lie apart
+    and nobody has chosen."""
+    talkers = _talkers(path)
+    two = len(log.apart) > 1 and float(np.median(log.apart)) > APART
+    if len(talkers) > 1:
+        counts = ', '.join(f'{talker} ({count})' for talker, count in talkers.most_common())
+        if two and not chosen:
+            options = ' or '.join(f'--talker {talker}' for talker in talkers)
+            raise BagError(
+                f'{path} holds positions of the talkers {counts}, which are '
+                f'{np.median(log.apart):.3g} m apart: two receivers. Say which: {options}'
+            )
+        report.notes['talkers'] = f'{counts}: the positions of {log.talker} are used'
+    elif two:
+        report.questions.append(
+            f'{path.name}: {len(log.apart)} positions of one moment are '
+            f'{np.median(log.apart):.3g} m apart: are there two receivers in one log? The first '
+            'of each moment is used'
+        )
+
+
+def _talkers(path: Path) -> Counter[str]:
+    """How many sentences each talker says of the place of the receiver."""
+    found = (OWN.search(line) for _, line in _lines(path))
+    return Counter(match[1] for match in found if match)
+
+
+def _read(path: Path, report: ConversionReport, how: NmeaOptions) -> _Log:
     try:
         import pyais
         import pynmea2
@@ -137,7 +177,14 @@ def _read(path: Path, report: ConversionReport, day: str) -> _Log:
         raise BagError(
             "logs of NMEA sentences need pyais and pynmea2: pip install 'sonar_imm[nmea]'"
         ) from None
-    log = _Log(_day(day))
+    log = _Log(_day(how.date))
+    talkers = _talkers(path)
+    if how.talker and how.talker not in talkers:
+        raise BagError(
+            f'no position in {path} is of the talker {how.talker}; there are '
+            f'{", ".join(talkers) or "none"}'
+        )
+    log.talker = how.talker or next((talker for talker, _ in talkers.most_common(1)), '')
     wrong = (pynmea2.ParseError, pyais.exceptions.AISBaseException, BadRow, Rejection)
     for number, line in _lines(path):
         found = SENTENCE.match(line)
@@ -152,6 +199,12 @@ def _read(path: Path, report: ConversionReport, day: str) -> _Log:
             head = sentence[1:].partition(',')[0]
             if head in USBL:
                 _take_usbl(log, pynmea2.NMEASentence.checksum, sentence, stamp)
+            elif head[2:] == 'THS':  # which pynmea2 does not know
+                _, degrees, mode = _fields(pynmea2.NMEASentence.checksum, sentence)[:3]
+                log.clock = stamp or log.clock
+                if mode == 'V':
+                    raise BadRow('is flagged as invalid', 'flagged invalid')
+                _take_heading(log, float(degrees or 'nan'))
             elif head in OTHER_USBL:
                 log.hears = True
                 raise BadRow(
@@ -222,8 +275,8 @@ def _take(log: _Log, sentence: Any, stamp: int | None) -> None:
         _tell_time(log, clock)
     if kind in ('GGA', 'RMC', 'GLL', 'GNS'):
         _take_own(log, sentence)
-    elif kind in ('HDT', 'THS'):
-        _take_heading(log, float(sentence.data[0]))
+    elif kind == 'HDT':
+        _take_heading(log, float(sentence.data[0] or 'nan'))
     elif kind == 'GST':
         stds = [float(std) for std in (sentence.std_dev_latitude, sentence.std_dev_longitude)]
         log.std = max(stds)
@@ -294,18 +347,31 @@ def _take_own(log: _Log, sentence: Any) -> None:
         covariance=covariance,
         frame_id='gps',
     )
-    log.place = fix.latitude, fix.longitude
+    apart = 0.0
+    if log.seen is None or log.seen[0].stamp_ns != stamp_ns:
+        log.seen = fix, sentence.talker, kind
+    else:
+        first, talker, other = log.seen
+        there = Origin(first.latitude, first.longitude, 0.0)
+        apart = float(np.hypot(*there.local(fix.latitude, fix.longitude, 0.0)[:2]))
+        # A receiver says one kind of sentence once.
+        log.apart += [apart] if talker != sentence.talker or kind == other else []
+    if sentence.talker != log.talker:
+        return
     if not log.own or log.own[-1].stamp_ns != stamp_ns:
         log.own.append(fix)
+    elif apart > APART:
+        return
     elif kind == 'GGA':  # of several of one moment the one with a height
         log.own[-1] = fix
+    log.place = fix.latitude, fix.longitude
 
 
 def _take_heading(log: _Log, degrees: float, roll: float = 0.0, pitch: float = 0.0) -> None:
     """How the vessel lies, degrees: clockwise from true north, and the Euler angles of axes
     forward, left, up. Raises `BadRow`."""
-    if not abs(degrees) <= 360.0:
-        raise BadRow('has no heading', 'no heading')
+    if not 0.0 <= degrees <= 360.0:
+        raise BadRow('has no heading from 0 to 360 degrees', 'no heading')
     log.heading, stamp_ns = degrees % 360.0, _now(log)
     if log.headings and log.headings[-1].stamp_ns == stamp_ns:
         return
@@ -342,6 +408,14 @@ def _take_target(log: _Log, away: FloatArray, name: str) -> None:
     log.targets.append(row | {'id': name})
 
 
+def _fields(checksum: Callable[[str], int], sentence: str) -> list[str]:
+    """The fields of a sentence, its name first. Raises `BadRow`."""
+    body, _, stated = sentence[1:].strip().rpartition('*')
+    if checksum(body) != int(stated, 16):
+        raise BadRow('has another checksum than it states')
+    return body.split(',')
+
+
 def _take_usbl(
     log: _Log, checksum: Callable[[str], int], sentence: str, stamp: int | None
 ) -> None:
@@ -349,10 +423,7 @@ def _take_usbl(
     ``PSIMSSB`` its place ahead and to starboard, and its depth, ``PSIMSNS`` how the vessel lies,
     roll positive to starboard and pitch positive with the bow up. Raises `BadRow`."""
     log.hears = True
-    body, _, stated = sentence[1:].strip().rpartition('*')
-    if checksum(body) != int(stated, 16):
-        raise BadRow('has another checksum than it states')
-    head, *fields = body.split(',')
+    head, *fields = _fields(checksum, sentence)
     if head == 'USRTH':
         log.clock = stamp or log.clock
         distance = float(fields[3])

@@ -113,7 +113,7 @@ class _Seen:
         """Count the echoes and samples of an image. channels: of its side."""
         self.images += 1
         self.echoes += echoes
-        magnitudes = [channel for channel in channels if not _is_phase(channel)]
+        magnitudes = _magnitudes(channels, self.how)
         self.frequencies |= {float(channel['frequency']) for channel in magnitudes}
         samples = magnitudes[0]['samples']
         if samples.dtype.kind in 'iu':
@@ -189,6 +189,14 @@ def _sides(ping: Record, port_samples: str) -> dict[str, list[Record]]:
     return found
 
 
+def _magnitudes(channels: list[Record], how: XtfOptions) -> list[Record]:
+    """The channels of magnitudes of a side, first the one that is used."""
+    found = [channel for channel in channels if not _is_phase(channel)]
+    if (wanted := how.frequency) is not None:
+        found.sort(key=lambda channel: abs(channel['frequency'] - wanted))
+    return found
+
+
 def _is_phase(channel: Record) -> bool:
     return 'phase' in channel['name'].lower()
 
@@ -205,11 +213,9 @@ def _ranges(channel: Record, sound_speed: float) -> np.ndarray:
 
 def _image(ping: Record, channels: list[Record], how: XtfOptions) -> SonarImage | None:
     """The magnitudes of one side: an image of one beam, seen from the array."""
-    magnitudes = [channel for channel in channels if not _is_phase(channel)]
+    magnitudes = _magnitudes(channels, how)
     if not magnitudes:
         return None
-    if (wanted := how.frequency) is not None:
-        magnitudes.sort(key=lambda channel: abs(channel['frequency'] - wanted))
     return SonarImage(
         stamp_ns=ping['stamp_ns'],
         range=_ranges(magnitudes[0], speed_of(ping)),

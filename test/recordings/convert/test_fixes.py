@@ -343,3 +343,18 @@ def test_advice_about_the_truth_names_the_options_of_the_truth(
         tmp_path / 'in.csv', tmp_path / 'helped', truth=path, truth_options=CsvOptions(**helps)
     )
     assert report.messages['/truth/estimate'] == 1 and report.problems == []
+
+
+@pytest.mark.parametrize(
+    'stamp, words',
+    [('10:{0:02d}:00', 'whole minutes. If'), ('10:00:{0:02d}', 'whole seconds. If')],
+)
+def test_rows_that_share_a_stamp_are_said(tmp_path, stamp, words):
+    rows = [f'2024-05-31T{stamp.format(k // 10)}Z,{k},{0.5 * k}' for k in range(60)]
+    (tmp_path / 'fixes.csv').write_text('\n'.join(['time,x,y', *rows]) + '\n')
+    report = convert_fixes(tmp_path / 'fixes.csv', tmp_path / 'bag')
+    said = report.notes['shared stamps']
+    assert 'up to 10 rows have one stamp' in said and words in said
+    one_each = [f'2024-05-31T10:{k:02d}:00Z,{k},1' for k in range(60)]
+    (tmp_path / 'fixes.csv').write_text('\n'.join(['time,x,y', *one_each]) + '\n')
+    assert 'shared stamps' not in convert_fixes(tmp_path / 'fixes.csv', tmp_path / 'b2').notes

@@ -10,6 +10,7 @@
 
 from datetime import datetime, timedelta, timezone
 import math
+import shutil
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -71,6 +72,11 @@ def messages_of(path):
 def scans_of(path):
     with BagReader(path) as bag:
         return [item.measurement for item in measurements_of(bag, 'diver', {'/fixes': 'fixes'})]
+
+
+def fixes_of(path):
+    with BagReader(path) as bag:
+        return [item.measurement for item in measurements_of(bag, 'diver', {'/fix': 'fix'})]
 
 
 def ns(moment):
@@ -297,3 +303,66 @@ def test_the_date_is_advised_only_where_it_helps(tmp_path):
     with pytest.raises(BagError, match='60 of 60 rows.*no time') as caught:
         converted(tmp_path, [ais(211_000_000, PLACE, 60)] * 60)
     assert '--date' not in caught.value.sentence
+
+
+def talker(sentence, name):
+    return str(pynmea2.parse(sentence)).replace('$GP', name).partition('*')[0]
+
+
+def by_talkers(apart, first='GP'):
+    """A log of two talkers, of which GN says more, `apart` m to the north."""
+    lines = []
+    for k in range(20):
+        moment = BEGIN + timedelta(seconds=k)
+        there = PLACE[0] + apart / 111e3, PLACE[1]
+        both = {
+            'GP': [talker(position('GGA', moment), 'GP')],
+            'GN': [talker(position(kind, moment, there), 'GN') for kind in ('RMC', 'GGA')],
+        }
+        for name in (first, 'GN' if first == 'GP' else 'GP'):
+            lines += [summed(body) for body in both[name]]
+    return lines
+
+
+@pytest.mark.parametrize('first', ['GP', 'GN'])
+def test_two_receivers_in_one_log_are_asked_for(tmp_path, first):
+    where = {'date': '2024-05-31', 'origin': PLACE}
+    with pytest.raises(BagError, match=r'31.2 m apart.*--talker GP'):
+        converted(tmp_path, by_talkers(31.0, first), **where)
+    with pytest.raises(BagError, match='GL; there are'):
+        converted(tmp_path, by_talkers(31.0, first), talker='GL')
+    for name, north in (('GP', 0.0), ('GN', 31.0)):
+        report = converted(tmp_path, by_talkers(31.0, first), talker=name, **where)
+        fixes = fixes_of(report.path)
+        assert [fix.position[1] for fix in fixes] == pytest.approx([north] * 20, abs=0.3)
+        assert f'of {name} are used' in report.notes['talkers']
+        shutil.rmtree(report.path)
+
+
+def test_one_receiver_with_two_talkers_gives_each_position_once(tmp_path):
+    report = converted(tmp_path, by_talkers(0.2), date='2024-05-31')
+    assert report.messages['/fix'] == 20 and 'GN (40), GP (20)' in report.notes['talkers']
+    assert not report.questions
+
+
+def test_two_receivers_of_one_talker_are_a_question(tmp_path):
+    lines = [
+        position('GGA', BEGIN + timedelta(seconds=k), (PLACE[0] + north, PLACE[1]))
+        for k in range(20)
+        for north in (0.0, 4e-4)
+    ]
+    report = converted(tmp_path, [position('RMC', BEGIN), *lines], origin=PLACE)
+    assert 'two receivers in one log' in report.questions[0]
+    fixes = fixes_of(report.path)
+    assert len(fixes) == 20 and max(abs(fix.position[1]) for fix in fixes) < 0.3
+
+
+@pytest.mark.parametrize(
+    'body', ['GPHDT,,T', 'GPHDT,-1.0,T', 'GPHDT,999.9,T', 'GPTHS,10.0,V', 'GPTHS,,V']
+)
+def test_headings_that_say_that_there_is_none_are_left_out(tmp_path, body):
+    moment = BEGIN + timedelta(seconds=1)
+    lines = [position('RMC', BEGIN), summed('GPTHS,90.0,A'), position('RMC', moment), summed(body)]
+    lines.append(ais(211, PLACE, 51))
+    report = converted(tmp_path, lines)
+    assert report.messages['/heading'] == 1 and report.bad_rows == 1

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from msg_adapters.array_records import read_trace
+from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.convert import convert_segy
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.segy_lines import read_segy
@@ -268,3 +269,18 @@ def test_a_file_that_is_cut_off_keeps_its_whole_traces(tmp_path, order):
     path.write_bytes(path.read_bytes()[:-5])
     line = read_segy(path)
     assert line.amplitude == pytest.approx(VALUES[:2]) and 'cut off in trace 3' in line.problems[0]
+
+
+def test_the_speed_of_sound_may_be_a_file_with_its_profile(tmp_path, capsys):
+    """A vertical path through 20 m of 1480 m/s and 20 m of 1520 m/s."""
+    path, profile = write(tmp_path / 'line.sgy', delay=40), tmp_path / 'cast.csv'
+    profile.write_text('depth,sound_speed\n0,1480\n20,1480\n20.001,1520\n40.001,1520\n')
+    asked = ['convert', 'segy', str(path), str(tmp_path / 'bag'), '--sound-speed']
+    assert main([*asked, str(profile)]) == 0
+    with BagReader(tmp_path / 'bag') as bag:
+        message = next(bag.messages(['/trace'])).message
+    mean = 40.0 / (20.0 / 1480.0 + 20.0 / 1520.0)
+    assert read_trace(message).depth[0] == pytest.approx(0.5 * mean * 0.040, abs=2e-3)
+    for wrong, words in (('absent.svp', 'not a valid'), ('12', 'range'), (str(path), 'profile')):
+        assert main([*asked[:3], str(tmp_path / 'no'), asked[4], wrong]) == 2
+        assert words in capsys.readouterr().err

@@ -85,3 +85,18 @@ def test_more_than_a_hundredth_at_full_scale_is_said(clipped, tmp_path):
     seen.tell(tmp_path / 'a.xtf', report)
     assert seen.clipped == clipped and seen.samples == 100
     assert any('full scale' in question for question in report.questions) == (clipped > 1)
+
+
+def test_samples_at_full_scale_are_those_of_the_frequency_that_is_used(tmp_path):
+    loud, calm = np.full(100, 32767, np.int16), np.ones(100, np.int16)
+    channels = [{**channel(loud), 'frequency': 4e5}, {**channel(calm), 'frequency': 9e5}]
+    for frequency, clipped in ((None, 100), (4.1e5, 100), (8e5, 0)):
+        seen = side_scan._Seen(XtfOptions(frequency=frequency))
+        image = side_scan._image(
+            {'stamp_ns': 1, 'sound_speed': 1500.0, 'nav': None}, channels, seen.how
+        )
+        seen.image(image, channels, 1)
+        assert seen.clipped == clipped and (image.amplitude.max() == 32767) == (clipped > 0)
+        report = ConversionReport(tmp_path)
+        seen.tell(tmp_path / 'a.xtf', report)
+        assert '--frequency HZ' in report.notes['frequencies']

@@ -9,11 +9,15 @@
 """Positions in GPX, KML and GeoJSON become what the same positions in a CSV become."""
 
 import json
+import struct
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
+import pymap3d
 import pytest
+from scipy.integrate import quad
+from scipy.optimize import brentq
 
 from sonar_imm_tools.recordings.convert import convert_fixes, convert_truth
 from sonar_imm_tools.recordings.measurements import measurements_of
@@ -178,3 +182,69 @@ def test_the_commonest_problem_is_named_and_its_advice_helps(tmp_path):
         convert_fixes(path, tmp_path / 'out')
     report = convert_fixes(path, tmp_path / 'out', options=CsvOptions(time_zone='UTC'))
     assert report.messages == {'/fix': 50}
+
+
+def in_metres(name, count=30):
+    """GeoJSON of points in a map projection, and their latitudes and longitudes."""
+    east, north = 500_000.0 + 10.0 * np.arange(count), 5_983_000.0 + 7.0 * np.arange(count)
+    features = [
+        {
+            'type': 'Feature',
+            'properties': {'time': f'2024-05-31T10:00:{k:02d}Z'},
+            'geometry': {'type': 'Point', 'coordinates': [east[k], north[k]]},
+        }
+        for k in range(count)
+    ]
+    crs = {'type': 'name', 'properties': {'name': name}}
+    # Near the central meridian: the arc of the ellipsoid along it, and the circle across it.
+    axis, squared, scale = 6378137.0, 0.00669438, 0.9996
+
+    def radius(phi, power):
+        return axis / (1.0 - squared * np.sin(phi) ** 2) ** power
+
+    def arc(phi):
+        return scale * quad(lambda part: (1.0 - squared) * radius(part, 1.5), 0.0, phi)[0]
+
+    phi = np.array([brentq(lambda part, at=at: arc(part) - at, 0.9, 1.0) for at in north])
+    latitude = np.degrees(phi)
+    longitude = 9.0 + np.degrees((east - 500_000.0) / (scale * radius(phi, 0.5) * np.cos(phi)))
+    return {'type': 'FeatureCollection', 'crs': crs, 'features': features}, latitude, longitude
+
+
+@pytest.mark.parametrize('cut', [False, True])
+@pytest.mark.parametrize('name', ['urn:ogc:def:crs:EPSG::25832', 'EPSG:32632'])
+def test_geojson_in_a_map_projection(tmp_path, name, cut):
+    whole, latitude, longitude = in_metres(name)
+    text = json.dumps(whole)
+    (tmp_path / 'dive.geojson').write_text(text[:-20] if cut else text)
+    origin = float(latitude[0]), float(longitude[0])
+    report = convert_fixes(tmp_path / 'dive.geojson', tmp_path / 'bag', origin=origin)
+    with BagReader(report.path) as bag:
+        fixes = [item.measurement for item in measurements_of(bag, 'diver', {'/fix': 'fix'})]
+    expected = pymap3d.geodetic2enu(latitude, longitude, 0.0, *origin, 0.0)
+    places = np.array([fix.position[:2] for fix in fixes])
+    assert len(places) == 30 - cut
+    assert places == pytest.approx(np.transpose(expected)[: 30 - cut, :2], abs=0.01)
+
+
+def test_geojson_in_a_system_that_is_not_known_is_one_sentence(tmp_path):
+    whole, _, _ = in_metres('our own grid')
+    (tmp_path / 'dive.geojson').write_text(json.dumps(whole))
+    with pytest.raises(BagError, match="'our own grid', which is not known"):
+        convert_fixes(tmp_path / 'dive.geojson', tmp_path / 'bag')
+
+
+@pytest.mark.parametrize('name, layer', [('a.gpx', 'track_points'), ('d.geojson', None)])
+def test_gdal_reads_the_same_places(tmp_path, name, layer):
+    pyogrio = pytest.importorskip('pyogrio')
+    path = tmp_path / name
+    path.write_text(TEXTS[name]())
+    _, _, geometry, _ = pyogrio.raw.read(path, layer=layer)
+    there = np.array([struct.unpack('<2d', each[5:21]) for each in geometry])
+    report = convert_truth(path, tmp_path / 'truth', origin=(54.0, 10.0))
+    assert report.rows == len(there) == 4
+    report = convert_fixes(path, tmp_path / 'bag', origin=(54.0, 10.0))
+    places = np.concatenate([scan.position[:, :2] for scan in fixes_of(report.path)])
+    wanted = np.transpose(pymap3d.geodetic2enu(*there.T[::-1], 0.0, 54.0, 10.0, 0.0))[:, :2]
+    # As high as they are, they lie a little nearer.
+    assert sorted(places.tolist()) == pytest.approx(np.array(sorted(wanted.tolist())), abs=0.05)

@@ -11,6 +11,7 @@
 import csv
 import json
 import math
+import struct
 from xml.etree import ElementTree
 
 from helpers.dive_bags import write_dive
@@ -136,6 +137,19 @@ def test_gis_programs_see_the_lines_of_kml(run, tmp_path):
     _, _, geometry, _ = pyogrio.raw.read(path)
     kinds = [int.from_bytes(each[1:5], 'little' if each[0] else 'big') for each in geometry]
     assert 2 in [kind & 0xFF for kind in kinds]  # a line string in WKB
+
+
+@pytest.mark.parametrize('name, layer', [('a.gpx', 'track_points'), ('a.geojson', None)])
+def test_gdal_reads_the_places_that_were_written(run, tmp_path, name, layer):
+    pyogrio = pytest.importorskip('pyogrio')
+    path = exported(run, tmp_path / name)
+    _, _, geometry, _ = pyogrio.raw.read(path, layer=layer)
+    points = [each for each in geometry if each[1] & 0xFF == 1]
+    there = np.array([struct.unpack('<2d', each[5:21]) for each in points])
+    table = exported(run, tmp_path / 'a.csv')
+    with table.open() as file:
+        rows = [(float(row['longitude']), float(row['latitude'])) for row in csv.DictReader(file)]
+    assert there == pytest.approx(np.array(rows), abs=1e-8)
 
 
 def test_a_place_on_earth_can_be_told(run, tmp_path):

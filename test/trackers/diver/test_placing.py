@@ -142,6 +142,58 @@ def test_an_unknown_height_is_that_of_the_origin():
     assert known.tolist() == unknown.tolist()
 
 
+FAR = Origin(10.0, 60.0)
+
+
+def way(count, **values):
+    return [geodetic(k + 1, (0.5 * k, 0.0, 0.0), **values) for k in range(count)]
+
+
+def test_a_first_position_far_away_does_not_stay_the_origin():
+    for wrong in (1, 2):
+        items = [
+            geodetic(k + 1, (0.0, 0.0, 0.0), origin=FAR) if k < wrong else item
+            for k, item in enumerate(way(20))
+        ]
+        tracker = DiverTracker(DiverConfig())
+        last = run(tracker, items)[-1]
+        assert len(last) == 1 and last.extras['track_id'] == [2]
+        assert last.extras['latitude'] == pytest.approx([items[-1].latitude], abs=1e-6)
+        assert last.extras['longitude'] == pytest.approx([items[-1].longitude], abs=1e-6)
+        assert np.abs(last.state[0, :2]).max() < 20.0
+        assert tracker.counts['origin_moved'] == 1 and tracker.counts['far_from_origin'] == 2
+        assert 'taken for wrong' in tracker.warnings()[0]
+
+
+@pytest.mark.parametrize('at', [3, 10])
+def test_positions_far_from_an_origin_that_is_known_are_left_out_and_said(at):
+    items = way(20)
+    items[at] = geodetic(at + 1, (0.0, 0.0, 0.0), origin=FAR)
+    tracker = DiverTracker(DiverConfig())
+    last = run(tracker, items)[-1]
+    assert last.extras['track_id'] == [1] and not tracker.counts['origin_moved']
+    assert 'the parameter origin' in tracker.warnings()[0]
+    for place, used in ((ORIGIN, 20), (FAR, 0)):
+        stated = DiverTracker(DiverConfig(origin=(place.latitude, place.longitude, 0.0)))
+        assert len(run(stated, way(20))) == used
+        assert stated.counts['far_from_origin'] == 20 - used
+
+
+def test_a_vessel_whose_first_position_is_wrong_places_its_targets():
+    items = []
+    for k in range(1, 30):
+        items += [
+            geodetic(k, (2.0 * k, 0.0, 0.0), VesselFix, origin=FAR if k == 1 else ORIGIN),
+            VesselHeading(stamp_ns=k * SECOND, orientation=(0.0, 0.0, 0.0, 1.0)),
+            relative(k + 0.5, (20.0 + 0.01 * k, 5.0, 0.0)),
+        ]
+    tracker = DiverTracker(DiverConfig())
+    last = run(tracker, items)[-1]
+    there = ORIGIN.geodetic(np.array([2.0 * 28.5 + 20.28, 5.0, 0.0]))
+    assert last.extras['latitude'] == pytest.approx([there[0]], abs=1e-5)
+    assert last.extras['longitude'] == pytest.approx([there[1]], abs=2e-5)
+
+
 # -- relative to a vessel ------------------------------------------------------------------------
 
 

@@ -1,0 +1,247 @@
+# Copyright 2026 The sonar_imm developers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+
+"""One table of what a variance says besides its number, on every road into the diver tracker."""
+
+import math
+import sys
+
+import numpy as np
+import pytest
+
+from msg_adapters.fixes import (
+    read_fix,
+    read_geodetic,
+    read_relative,
+    read_vessel_fix,
+    write_fix,
+    write_geodetic,
+    write_relative,
+)
+from msg_adapters.navigation import (
+    read_heading,
+    read_vessel_pose,
+    write_heading,
+    write_navigation,
+)
+from msg_adapters.scans import read_scan, write_scan
+from sonar_imm.acoustics.geometry import Pose, rotation
+from sonar_imm.intake import Intake, moved
+from sonar_imm.measurements import (
+    Fix,
+    Fixes,
+    GeodeticFix,
+    Rejection,
+    RelativeFix,
+    VesselFix,
+    VesselHeading,
+    VesselPose,
+)
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm_tools.recordings.messages import ros_message
+
+S = 10**9
+STOOD = (0.0, 0.0, 0.0, 1.0)
+MOST = sys.float_info.max
+UNKNOWN = [math.nan, -math.inf, -1e9, -1.0, 0.0]
+TINY = [1e-30, 1e-13]
+UNMEASURED = [1e6, 1e9, 1e10, 1e17, MOST, math.inf]
+HUGE_ANGLES = [0.31, math.pi**2 / 3, math.pi**2, 99.0, 1e3, 1e6, 1e10, MOST, math.inf]
+
+
+def variances(message, *diagonal):
+    """The message with these variances and nothing beside them."""
+    size = len(message.pose.covariance)
+    whole = np.zeros((math.isqrt(size),) * 2)
+    np.fill_diagonal(whole, diagonal)
+    message.pose.covariance[:] = whole.ravel()
+    return message
+
+
+def pose_of_fix(variance):
+    fix = Fix(stamp_ns=S, position=(1.0, 2.0, 0.0), frame_id='map')
+    return read_fix(variances(write_fix(fix, ros_message), *[variance] * 6))
+
+
+def of_satellites(kind):
+    def read(variance):
+        message = write_geodetic(
+            GeodeticFix(stamp_ns=S, latitude=59.0, longitude=10.0), ros_message
+        )
+        message.position_covariance[:] = np.diag(np.full(3, variance)).ravel()
+        message.position_covariance_type = kind
+        return read_geodetic(message)
+
+    return read
+
+
+def of_vessel(variance):
+    message = write_geodetic(VesselFix(stamp_ns=S, latitude=59.0, longitude=10.0), ros_message)
+    message.position_covariance[:] = np.diag(np.full(3, variance)).ravel()
+    message.position_covariance_type = 2
+    return read_vessel_fix(message)
+
+
+def of_transceiver(variance):
+    fix = RelativeFix(stamp_ns=S, offset=(30.0, 4.0, -5.0), frame_id='usbl')
+    return read_relative(variances(write_relative(fix, ros_message), *[variance] * 6))
+
+
+def row_of_scan(variance):
+    """A row of a table of fixes, beside a good one."""
+    scan = Fixes(
+        stamp_ns=S,
+        position=np.array([[1.0, 2.0, 0.0], [5.0, 5.0, 0.0]]),
+        covariance=np.stack([np.diag([4.0, 4.0, np.nan]), np.eye(3)]),
+        frame_id='map',
+    )
+    message = write_scan(scan, ros_message)
+    names = [field.name for field in message.fields]
+    rows = np.array(message.data).reshape(2, message.point_step)
+    for name in ('cov_x_x', 'cov_y_y'):
+        at = message.fields[names.index(name)].offset
+        with np.errstate(over='ignore'):
+            rows[0, at : at + 4] = np.array([variance], np.float32).view(np.uint8)
+    message.data = rows.ravel()
+    read = read_scan(message)
+    if len(read) == 1:
+        raise Rejection('not_measured' if variance >= 1.0 else 'out_of_range', 'left out')
+    known = not np.isnan(read.covariance[0, 0, 0])
+    return Fix(stamp_ns=S, position=read.position[0], covariance=np.eye(2) if known else None)
+
+
+ROADS = {
+    'PoseWithCovarianceStamped': pose_of_fix,
+    'NavSatFix diagonal': of_satellites(2),
+    'NavSatFix known': of_satellites(3),
+    'NavSatFix of the vessel': of_vessel,
+    'relative': of_transceiver,
+    'row of a table': row_of_scan,
+}
+
+
+@pytest.mark.parametrize('read', ROADS.values(), ids=list(ROADS))
+def test_variances_of_x_and_y(read):
+    for variance in UNKNOWN:
+        assert read(variance).covariance is None, variance
+    for variance in (1e-10, 0.25, 99.0, 1e4):
+        assert read(variance).covariance is not None, variance
+    for reason, refused in (('out_of_range', TINY), ('not_measured', UNMEASURED)):
+        for variance in refused:
+            with pytest.raises(Rejection) as refusal:
+                read(variance)
+            assert refusal.value.reason == reason, variance
+
+
+def test_one_axis_that_is_far_from_known_is_used():
+    """As a bearing and a range from far away say it."""
+    fix = Fix(stamp_ns=S, position=(5e4, 0.0, 0.0), frame_id='map')
+    message = variances(write_fix(fix, ros_message), 4.0, 3e6, 0.0, 0.0, 0.0, 0.0)
+    assert read_fix(message).covariance[1, 1] == 3e6
+
+
+def odometry(second, *diagonal):
+    pose = VesselPose(
+        stamp_ns=round(second * S), position=(0.0, 0.0, 0.0), orientation=STOOD, frame_id='odom'
+    )
+    return read_vessel_pose(variances(write_navigation(pose, ros_message), *diagonal))
+
+
+def by_heading(second, *diagonal):
+    """A place on Earth that is exactly known, and the orientation of an IMU."""
+    heading = VesselHeading(stamp_ns=round(second * S), orientation=STOOD, frame_id='vessel')
+    message = write_heading(heading, ros_message)
+    message.orientation_covariance[:] = np.diag(diagonal[3:]).ravel()
+    return read_heading(message)
+
+
+def seen(read, *diagonal, config=None):
+    """The tracker after a relative fix of a vessel with these variances, and its estimate."""
+    tracker = DiverTracker(config or DiverConfig(covariance_scales=(1.0,)))
+    intake, made = Intake(tracker), []
+    covariance = 0.25 * np.eye(3)
+    for second in (4, 6):
+        if read is by_heading:
+            made.append(
+                VesselFix(
+                    stamp_ns=second * S, latitude=59.0, longitude=10.0, covariance=covariance
+                )
+            )
+        made.append(read(second, *diagonal))
+    made.append(RelativeFix(stamp_ns=5 * S, offset=(100.0, 0.0, -20.0), frame_id='usbl'))
+    rows = [row for item in made for row in tracker.process(intake.admit(item))]
+    return tracker, rows[-1] if rows else None
+
+
+PLACE, LEVEL, HEADING = [0.25] * 3, [1e-4, 1e-4], 1e-3
+POSES = pytest.mark.parametrize('read', [odometry, by_heading])
+
+
+@POSES
+@pytest.mark.parametrize('variance', HUGE_ANGLES)
+def test_a_heading_that_is_not_measured_gives_no_position(read, variance):
+    tracker, made = seen(read, *PLACE, *LEVEL, variance)
+    assert made is None and tracker.counts['heading_unmeasured'] == 1
+    assert 'heading is not measured' in tracker.warnings()[0]
+
+
+@POSES
+@pytest.mark.parametrize('variance', HUGE_ANGLES)
+def test_roll_and_pitch_that_are_not_measured_are_the_parameter_and_said(read, variance):
+    std = np.radians(DiverConfig().vessel_attitude_std_deg)
+    _, expected = seen(read, *PLACE, std**2, std**2, HEADING)
+    tracker, made = seen(read, *PLACE, variance, variance, HEADING)
+    assert made.covariance == pytest.approx(expected.covariance, rel=1e-6)
+    assert 'roll or pitch is not measured' in tracker.warnings()[0]
+
+
+@POSES
+@pytest.mark.parametrize('variance', [math.nan, -math.inf, -1.0])
+def test_an_axis_that_nobody_knows_is_the_parameter_and_the_others_stay(read, variance):
+    """NaN means the same of a vessel as of a fix."""
+    config = DiverConfig(covariance_scales=(1.0,), vessel_heading_std_deg=7.0)
+    own, level = np.radians(7.0) ** 2, np.radians(config.vessel_attitude_std_deg) ** 2
+    for given, whole in (
+        ([*LEVEL, variance], [*LEVEL, own]),
+        ([variance, 1e-4, HEADING], [level, 1e-4, HEADING]),
+        ([0.0, 0.0, variance], [level, level, own]),
+    ):
+        if read is by_heading and given[0] == -1.0:
+            continue  # the sign of an IMU without an orientation
+        tracker, made = seen(read, *PLACE, *given, config=config)
+        _, expected = seen(read, *PLACE, *whole, config=config)
+        assert made.covariance == pytest.approx(expected.covariance, rel=1e-6)
+        assert not tracker.counts['heading_unmeasured'] + tracker.counts['attitude_unmeasured']
+
+
+def test_an_unknown_place_of_the_vessel_is_the_parameter_and_an_unmeasured_one_none():
+    config = DiverConfig(covariance_scales=(1.0,), vessel_position_std=3.0)
+    _, expected = seen(odometry, *[9.0] * 3, *LEVEL, HEADING, config=config)
+    for variance in UNKNOWN:
+        _, made = seen(odometry, *[variance] * 3, *LEVEL, HEADING, config=config)
+        assert made.covariance == pytest.approx(expected.covariance, rel=1e-6)
+    for variance in UNMEASURED:
+        tracker, made = seen(odometry, *[variance] * 3, *LEVEL, HEADING, config=config)
+        assert made is None and tracker.counts['position_unmeasured'] == 1
+        assert 'place is not measured' in tracker.warnings()[0]
+
+
+def test_what_is_unknown_stays_so_in_another_frame_and_on_the_way_out():
+    whole = np.diag([0.25, 0.36, 0.49, 1e-4, 2e-4, 3e-4])
+    whole[2], whole[:, 2], whole[3], whole[:, 3] = np.nan, np.nan, np.nan, np.nan
+    pose = VesselPose(
+        stamp_ns=S, position=(1.0, 2.0, 0.0), orientation=STOOD, frame_id='odom',
+        pose_covariance=whole,
+    )  # fmt: skip
+    again = read_vessel_pose(write_navigation(pose, ros_message))
+    assert again.pose_covariance == pytest.approx(whole, nan_ok=True)
+    turned = moved(pose, 'map', Pose(np.zeros(3), rotation(0.0, 0.0, np.pi / 2))).pose_covariance
+    assert np.diag(turned) == pytest.approx([0.36, 0.25, *[np.nan] * 3, 3e-4], nan_ok=True)
+    heading = VesselHeading(stamp_ns=S, orientation=STOOD, covariance=whole[3:, 3:])
+    again = read_heading(write_heading(heading, ros_message))
+    assert again.covariance == pytest.approx(whole[3:, 3:], nan_ok=True)
