@@ -356,23 +356,6 @@ def test_a_function_may_write_into_the_particles_it_is_given():
     assert (first == 1.0).all() and set(tracker.particles[0].ravel()) == {2.0}
 
 
-def test_the_filters_need_no_compiler():
-    code = (
-        'import sys, numpy as np\n'
-        'from sonar_imm import cv, hover, IMM, ParticleIMM, position\n'
-        'imm = IMM([cv(0.1), hover(0.1)], np.eye(2), np.zeros(4), np.eye(4), position(1.0))\n'
-        'imm.step([0.0, 0.0])\n'
-        'imm.step([1.0, 0.0], dt=0.5)\n'
-        'imm.smooth()\n'
-        'rng = np.random.default_rng(0)\n'
-        'pf = ParticleIMM({"a": lambda x, rng, dt: x}, [[1.0]], np.ones((5, 1)),\n'
-        '                 lambda x, z: -x[:, 0], rng)\n'
-        'pf.step(0.0)\n'
-        'assert "numba" not in sys.modules'
-    )
-    subprocess.run([sys.executable, '-c', code], check=True)
-
-
 # -- the verbs of IMM -----------------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@
 from pathlib import Path
 
 from helpers.obstacle_runs import EXACT
-from helpers.obstacle_sea import column, encounter, ENCOUNTERS, track
+from helpers.obstacle_sea import column, ENCOUNTERS, tracked
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -124,8 +124,7 @@ def test_the_tracker_says_what_an_independent_one_does():
     last; its course is made a little differently."""
     off = {'cpa_distance': [], 'cpa_time': [], 'collision_probability': []}
     for name, number in ENCOUNTERS:
-        data = encounter(name, number)
-        estimates = track(data, course_std=0.05, **EXACT)
+        data, estimates = tracked(name, number, course_std=0.05, **EXACT)
         given = np.flatnonzero(np.isfinite(data['ref_collision']))
         for key, reference in zip(off, ('cpa_distance', 'cpa_time', 'collision')):
             off[key].extend(column(estimates, key, given) - data[f'ref_{reference}'][given])

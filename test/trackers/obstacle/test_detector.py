@@ -9,8 +9,6 @@
 """The detector of images: an independent image, its parameters, sweeps of a scanning sonar."""
 
 from pathlib import Path
-import subprocess
-import sys
 
 from attrs import evolve
 import numpy as np
@@ -229,22 +227,6 @@ def test_a_sweep_ends_where_it_does_not_go_on(spoil):
     answers = [detector.process(item) for item in first + more]
     assert sum(answer is not None for answer in answers) == 1
     assert answers[len(first)] is not None
-
-
-def test_an_image_needs_no_compiler():
-    program = """
-import sys
-import numpy as np
-from sonar_imm.measurements import SonarImage
-from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
-amplitude = np.random.default_rng(0).exponential(size=(60, 40))
-amplitude[30, 20] = 1e3
-place = {'range': 1.0 + np.arange(60.0), 'bearing': np.linspace(0.3, -0.3, 40)}
-print(len(detect(SonarImage(stamp_ns=1, amplitude=amplitude, **place), DetectorConfig())))
-print('numba' in sys.modules)
-"""
-    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
-    assert done.stdout.split() == ['1', 'False'], done.stderr
 
 
 def test_memory_is_bounded_whatever_comes():

@@ -136,14 +136,6 @@ def test_detections_without_navigation_wait_and_do_not_pile_up_results():
     assert tracker.health()['pings_waiting'] == 20
 
 
-def test_pings_that_wait_for_navigation_that_never_comes_are_bounded_and_counted():
-    tracker = ObstacleTracker(ObstacleConfig())
-    for k in range(MOST_WAITING + 300):
-        tracker.process(Detections(stamp_ns=SECOND * (k + 1), range=[50.0], bearing=[0.0]))
-    health = tracker.health()
-    assert health['pings_waiting'] == MOST_WAITING and health['navigation_missing'] == 300
-
-
 def test_the_newest_pings_are_those_that_are_kept():
     tracker = ObstacleTracker(ObstacleConfig(max_navigation_gap=1000.0, history=0.0))
     for k in range(MOST_WAITING + 3):
