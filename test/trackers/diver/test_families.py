@@ -246,27 +246,6 @@ def test_a_name_does_not_make_a_fix_good():
     assert named_rmse < 1.2
 
 
-def test_no_identity_goes_where_the_target_cannot_have_been():
-    """Two fixes that agree 100 m away are of another one, or of a burst."""
-    items = path(60)
-    jumped = [*items[:30], *(moved(item, 80.0, -60.0) for item in items[30:])]
-    estimates = run(DiverTracker(config(max_tracks=5)), jumped)
-    for estimate in estimates[30:34]:
-        row = np.flatnonzero(estimate.extras['track_id'] == 1)
-        assert np.abs(estimate.state[row, :2] - [21.0, 0.0]).max(initial=0.0) < 5.0
-    (last,) = ids(estimates)[-1]
-    assert last != 1
-    assert np.abs(estimates[-1].state[0, :2] - jumped[-1].position[:2]).max() < 3.0
-
-
-def test_wild_fixes_that_disagree_do_not():
-    items = path(60, target_id=7)
-    items[30], items[31] = moved(items[30], 80.0, -60.0), moved(items[31], -70.0, 20.0)
-    estimates = run(DiverTracker(config(max_tracks=5)), items)
-    assert np.abs(estimates[31].state[0, :2] - [21.7, 0.0]).max() < 3.0
-    assert set(np.concatenate(ids(estimates)).tolist()) == {1}
-
-
 def test_two_false_fixes_in_clutter_do_not_move_a_track():
     """Where so many are false that two may well agree, tracks begin by their hits."""
     items = path(40)
@@ -303,25 +282,6 @@ def test_transitions_are_learnt_inside_families_only():
     assert np.abs(learnt - nominal)[inside].max() > 0.01
 
 
-def test_several_divers_in_clutter():
-    """Two divers and false fixes: two tracks, by either association."""
-    for association in ('gnn', 'jipda'):
-        rng, extra = np.random.default_rng(5), []
-        settings = {'association': association, 'clutter_density': 2e-4, 'max_tracks': 5}
-        tracker = DiverTracker(config(**settings))
-        for k in range(40):
-            there = np.array([[0.7 * k, 0.0], [0.7 * k, 25.0]])
-            seen = (there + 0.5 * rng.normal(size=(2, 2)))[rng.uniform(size=2) < 0.9]
-            places = np.concatenate([seen, rng.uniform(-60.0, 60.0, (rng.poisson(3.0), 2))])
-            estimate = tracker.process(scan_of(k + 1, places))[-1]
-            firm = estimate.state[estimate.extras['track_state'] > 0, :2]
-            near = np.hypot(*(firm[:, None] - there).transpose(2, 0, 1)) < 3.0
-            assert k < 6 or near.any(axis=0).all(), association
-            extra.append((~near.any(axis=1)).sum())
-        assert np.mean(extra) < 0.15, association
-        assert np.isfinite(estimate.covariance).all()
-
-
 def test_smoothing_is_better_than_the_filter():
     rng = np.random.default_rng(2)
     heading = np.cumsum(np.where(rng.uniform(size=80) < 0.06, rng.normal(size=80), 0.0))
@@ -351,14 +311,6 @@ def test_smoothing_knows_when_behaviour_changed():
     assert np.mean([e.extras['hover'][0] for e in smoothed[52:]]) > 0.7
     speed = [np.hypot(*e.state[0, 2:]) for e in smoothed]
     np.testing.assert_allclose(speed[10:34], 2.0, atol=0.4)
-
-
-def test_depth_is_a_state_beside_families():
-    tracker = DiverTracker(config(dimensions=3, fix_bias_std=0.5))
-    assert tracker.models.scales == (1.0,) and tracker.models.rows_per_track == 3
-    estimate = run(tracker, path(30))[-1]
-    assert np.isfinite(estimate.state).all() and estimate.state_names[2] == 'pz'
-    assert np.abs(estimate.state[0, :2] - [20.3, 0.0]).max() < 2.5
 
 
 def test_one_row_and_no_hover():

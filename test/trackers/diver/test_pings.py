@@ -36,7 +36,6 @@ from sonar_imm.trackers.diver.heavy_tails import student_t_ping
 from sonar_imm.trackers.diver.instruments import Instruments, MOST_RECEIVERS
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.scan import ping_measurements
-from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
@@ -476,20 +475,6 @@ def test_covariances_stay_positive_definite(model_set, noise):
         repairs += health['covariance_repairs']
     if len(noise) > 1:
         assert repairs > 0
-
-
-def test_smoothing_keeps_them_and_counts_its_own():
-    counted = []
-    for seed in range(6):
-        tracker = SmoothingDiverTracker(config(*SETS[-1], seed))
-        for fix in sharp_fixes(seed):
-            tracker.process(fix)
-        filtered = tracker.health()['covariance_repairs']
-        for estimate in tracker.smoothed():
-            assert np.isfinite(estimate.state).all()
-            assert (least_eigenvalue(estimate.covariance) > -1e-14).all()
-        counted.append(tracker.health()['covariance_repairs'] - filtered)
-    assert min(counted) >= 0
 
 
 def test_ordinary_fixes_need_no_repair():

@@ -194,13 +194,6 @@ def test_a_named_track_goes_on_while_another_name_is_heard(association):
     assert (estimate.extras['target_id'] == 9).sum() == 1
 
 
-def test_a_named_track_ends_after_max_coast():
-    tracker = DiverTracker(DiverConfig(max_coast=10.0))
-    tracker.process(scan(1, (0.0, 0.0), ids=[9]))
-    (estimate,) = tracker.process(scan(12, (50.0, 0.0), ids=[5]))
-    assert estimate.extras['target_id'].tolist() == [5]
-
-
 def test_a_scan_with_names_and_without():
     tracker = DiverTracker(DiverConfig())
     for second in range(1, 10):
@@ -208,14 +201,6 @@ def test_a_scan_with_names_and_without():
         (estimate,) = tracker.process(scan(second, *places, ids=[3, -1, 3]))
     assert sorted(estimate.extras['target_id'].tolist()) == [-1, 3]
     assert len(estimate) == 2
-
-
-def test_the_column_of_fixes_may_be_mixed_with_single_fixes():
-    tracker = DiverTracker(DiverConfig(association='jipda'))
-    for second in range(1, 10):
-        tracker.process(fix(second, 0.0, 0.0))
-        (estimate,) = tracker.process(scan(second, (30.0, 0.0), ids=[3]))[-1:]
-    assert sorted(estimate.extras['target_id'].tolist()) == [-1, 3]
 
 
 def test_existence_of_a_track_that_was_counted_is_guessed_from_its_state():

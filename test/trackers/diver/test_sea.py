@@ -13,7 +13,6 @@ from helpers.diver_runs import fix
 import numpy as np
 import pytest
 
-from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.models import build_models
@@ -228,11 +227,6 @@ def test_without_anything_stated_no_state_is_added():
     known = tracker._stream.state
     assert [block.x.shape[1:] for block in known.rows.blocks] == [(3, 34), (4, 3)]
     assert known.memory['instruments'] == Instruments()
-
-
-def test_depths_that_do_not_fit_are_refused():
-    with pytest.raises(ConfigError, match='depth_min'):
-        DiverConfig.from_mapping({'depth_min': 30.0})
 
 
 @pytest.mark.parametrize('options', [{'sound_speed_std': 15.0}, OFF])

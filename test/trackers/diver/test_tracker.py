@@ -108,18 +108,6 @@ def test_consistency_where_the_models_hold():
     assert low < np.mean(squared) < high
 
 
-def test_an_outlier_is_not_believed():
-    tracker = DiverTracker(DiverConfig(max_tracks=1))
-    clean = DiverTracker(DiverConfig(max_tracks=1))
-    for second in range(1, 30):
-        outlier = second == 20
-        last = tracker.process(fix(second, 0.5 * second + 500.0 * outlier, 0.0))[-1]
-        if not outlier:
-            clean.process(fix(second, 0.5 * second, 0.0))
-    assert abs(last.state[0, 0] - 14.5) < 0.5
-    assert last.extras['track_id'][0] == 1
-
-
 def test_a_scan_that_misses_a_diver_teaches_nothing_of_its_turns():
     """Probabilities move by prediction alone then: learnt from, they would confirm the prior."""
     tracker = DiverTracker(DiverConfig())
