@@ -89,12 +89,6 @@ def test_proposals_change_how_many_particles_count_and_nothing_else(model, exact
         assert abs(evidence - EXACT_LOG_EVIDENCE) < 0.7
 
 
-def test_threads_do_not_change_a_byte(model, exact):
-    single, four = (run(model, exact['B'][:10], 3001, seed=5, threads=n) for n in (1, 4))
-    assert single[0].tobytes() == four[0].tobytes()
-    assert single[1].tobytes() == four[1].tobytes()
-
-
 def test_a_record_has_random_numbers_of_its_own(model, exact):
     tracker = SetFilter(model, 500)
     before = cycle(tracker, None, exact['B'][0], (3, 7)).after

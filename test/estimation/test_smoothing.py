@@ -433,37 +433,6 @@ def draw(rng, F, Q, B, H, R, x0, P0, mu, transition, K):
 # -- IMM: Monte Carlo -----------------------------------------------------------------------------
 
 
-def test_on_the_heading_set_smoothing_lowers_the_error_and_stays_honest():
-    """Sixteen headings with speed in the state, truth drawn from the models: measured .89 -> .57
-    m, NEES 3.9 -> 3.8 of 4."""
-    with np.load(VECTORS / 'imm_reference.npz') as vectors:
-        F, Q, B, E, transition, mu, x0, P0 = (
-            vectors[f'A10_speedstate16/{name}']
-            for name in ('F', 'Q', 'B', 'E', 'Pi', 'mu0', 'x0', 'P0')
-        )
-    H, R, K, rng = np.eye(2, 3), np.eye(2), 30, np.random.default_rng(5)
-    squares, nees, hits = [], [], []
-    for _ in range(20):
-        X, Z, J = draw(rng, F, Q, B, H, R, x0, P0, mu, transition, K)
-        truth = np.einsum('kqa,ka->kq', E[J], X)
-        moves = [repeat(part, K) for part in (transition, F, Q, B)]
-        filtered = imm_pass(*moves, H, R, x0, P0, mu, Z)
-        smoothed = imm_smooth(*filtered, *moves)
-        answers = imm.combine(*filtered, E), smoothed.combine(E)
-        squares.append([np.sum((x - truth)[:, :2] ** 2, axis=1).mean() for x, _ in answers])
-        nees.append(
-            [
-                np.einsum('ka,kab,kb->k', x - truth, np.linalg.inv(P), x - truth).mean()
-                for x, P in answers
-            ]
-        )
-        hits.append([got[np.arange(K), J].mean() for got in (filtered[2], smoothed.mu)])
-    filter_rmse, smoother_rmse = np.sqrt(np.mean(squares, axis=0))
-    assert smoother_rmse < 0.75 * filter_rmse
-    assert 3.2 < np.mean(nees, axis=0)[1] < 4.8
-    assert np.mean(hits, axis=0)[1] > np.mean(hits, axis=0)[0] + 0.05
-
-
 # -- Kim's pass over model probabilities ----------------------------------------------------------
 
 

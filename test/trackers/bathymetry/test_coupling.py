@@ -179,14 +179,6 @@ def test_pings_far_apart_and_other_sides_are_no_neighbours():
         assert same(by_itself.process(p)[0], each)
 
 
-def test_a_clock_set_back_begins_anew():
-    tracker = BathymetryTracker(COUPLED)
-    made = [each for k in (5, 6, 1, 2) for each in tracker.process(ping(k))]
-    assert [each.stamp_ns for each in [*made, *tracker.finish()]] == [
-        ping(k).stamp_ns for k in (5, 6, 1, 2)
-    ]
-
-
 def test_switched_off_the_held_ping_comes_out_first():
     tracker = BathymetryTracker(COUPLED)
     assert tracker.process(ping(0)) == []

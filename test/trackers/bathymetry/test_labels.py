@@ -118,17 +118,6 @@ def test_a_slope_is_smooth_floor_and_scatter_is_rough():
     assert held.mean() > 0.9
 
 
-def test_bins_without_an_echo_cannot_be_told_and_the_ping_goes_on():
-    snapshot = floor(0.0, shadow=slice(100, 160))
-    (estimate,) = BathymetryTracker(TERRAIN).process(snapshot)
-    silent = estimate.extras['valid'] == 0
-    assert silent[105:155].all() and (estimate.extras['told'][silent] == 2).all()
-    assert np.isfinite(estimate.state).all() and (estimate.covariance[:, 0, 0] > 0.0).all()
-    assert np.abs(estimate.state[170:, 0]).max() < 0.3
-    inside, before = estimate.covariance[130, 0, 0], estimate.covariance[90, 0, 0]
-    assert inside > before
-
-
 def test_neighbours_lean_on_each_other_in_terrain_too():
     config = evolve(TERRAIN, ping_coupling=0.3)
     scene = simulate(scenario('paper', {'pings': 2, 'last_range': 45.0}), 3)

@@ -123,26 +123,6 @@ def test_pings_wait_for_poses_in_whatever_order_they_come(order):
             np.testing.assert_array_equal(column, b.columns()[name])
 
 
-def test_a_ping_waits_until_its_last_bin_is_covered():
-    config = sea_config(CASE, navigation='required', particles_per_model=20)
-    ping, poses = next(snapshots(CASE)), navigation(CASE)
-    last = ping.stamp_ns + round(2e9 * CASE['r'][-1] / 1500.0)
-    tracker = BathymetryTracker(config)
-    tracker.process(ping)
-    for pose in poses:
-        made = tracker.process(pose)
-        assert bool(made) == (pose.stamp_ns >= last)
-        if made:
-            break
-        assert tracker.health()['pings_waiting'] == 1
-    assert tracker.counts['used'] == 1 and tracker.health()['pings_waiting'] == 0
-    early = BathymetryTracker(evolve(config, max_extrapolation=0.2))
-    for pose in poses:
-        if pose.stamp_ns < ping.stamp_ns + 10**7:
-            early.process(pose)
-    assert len(early.process(ping)) == 1
-
-
 def test_pings_in_a_gap_are_skipped_and_counted():
     config = sea_config(CASE, navigation='required', particles_per_model=20)
     tracker, pings = BathymetryTracker(config), list(snapshots(CASE))
@@ -186,17 +166,6 @@ def test_a_pose_from_more_than_an_hour_ahead_is_not_believed(seconds, used):
     tracker.process(pose)
     tracker.process(evolve(pose, stamp_ns=pose.stamp_ns + seconds * 10**9))
     assert tracker.counts['poses'] == used
-
-
-def test_a_clock_set_back_forgets_the_poses():
-    tracker = BathymetryTracker(sea_config(CASE, navigation='required', particles_per_model=20))
-    poses = navigation(CASE)
-    for pose in poses:
-        tracker.process(evolve(pose, stamp_ns=pose.stamp_ns + 4 * 10**12))
-    for pose in poses:
-        tracker.process(pose)
-    assert tracker.counts['restarts'] == 1
-    assert len(tracker.process(next(snapshots(CASE)))) == 1
 
 
 # -- start and nadir ------------------------------------------------------------------------------

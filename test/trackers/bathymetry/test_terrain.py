@@ -245,22 +245,6 @@ def test_both_ways_are_those_of_a_filter_on_cells(terrain, silent):
         assert track.log_likelihood == pytest.approx(answer.log_likelihood, abs=0.15)
 
 
-@pytest.mark.parametrize(
-    'wrong',
-    [
-        {'scatter': np.array([0.0, 0.0, 0.3])},
-        {'phi': np.array([0.0, 0.7, 0.0])},
-        {'transition': THREE.transition.T / THREE.transition.sum(axis=0)[:, None]},
-    ],
-    ids=['scatter', 'phi', 'transposed'],
-)
-def test_another_model_is_found_out(wrong):
-    (_, whole), _ = exact(THREE._replace(**wrong))
-    _, (_, cells) = exact(THREE)
-    _, mean, probability = far(whole, cells)
-    assert mean > 0.06 or probability > 0.02
-
-
 def test_the_slope_is_turned_round_for_the_inward_filter():
     """A ping read backwards, its slopes with it, is the same floor."""
     slope = 0.15
