@@ -128,8 +128,7 @@ def test_what_reaches_into_its_own_training_cells_is_left_out_of_the_noise():
 
 
 def test_a_wide_chain_does_not_lift_the_level_by_which_it_is_left_out():
-    """A chain along the line of sight, ten of 25 beams wide: its glints lift the mean logarithm by
-    which they are told from noise."""
+    """Ten of 25 beams wide: its glints lift the mean by which they are told from noise."""
     rng = np.random.default_rng(8)
     power = rng.exponential(size=(200, 100))
     power[80:120, 45:55] *= 20.0

@@ -80,8 +80,7 @@ def test_moments_are_about_the_row_and_not_about_the_origin():
 
 
 def test_states_behind_the_motion_are_mixed_by_identity():
-    """A constant that is the same in all models stays as it is; its correlation with the position
-    is the mean of those of the models."""
+    """A constant that is the same in all models stays as it is."""
     rng = np.random.default_rng(2)
     more = []
     for block in given_blocks():

@@ -50,8 +50,7 @@ def is_covariance(P):
 
 
 def ill_conditioned(rng, count, n, m):
-    """Batches of P, F, Q, H, R whose scales lie up to 1e24 apart: nearly and wholly dependent
-    components, measurements that repeat each other, noise that is nothing beside P, or zero."""
+    """Batches of P, F, Q, H, R whose scales lie up to 1e24 apart, dependent, repeated, or zero."""
 
     def covariance(size, low, high):
         root = rng.normal(size=(count, size, size))
@@ -120,8 +119,7 @@ def exact_posterior(P, H, R):
 
 
 def test_a_measurement_much_better_than_the_state():
-    """1e12 against 1e-6, eighteen digits, fifty times: what is claimed along the measurement is
-    neither less than the truth, 1e-6 / k, nor more than the stated limit allows."""
+    """What is claimed is neither less than the truth, 1e-6 / k, nor more than the limit allows."""
     P = np.diag([1e12, 1e12])[None, None]
     h = np.array([1.0, 1.0 + 1e-7])
     H, R = h[None, None, None], np.array([[[1e-6]]])
@@ -141,8 +139,7 @@ def test_a_measurement_much_better_than_the_state():
 @settings(deadline=None, max_examples=300)
 @given(st.integers(2, 4), st.integers(0, 2**32 - 1))
 def test_an_update_is_as_good_as_the_limit_says(n, seed):
-    """Against exact arithmetic, one measured value. Rounding the prior alone changes the result by
-    the rounding over the prior's least eigenvalue."""
+    """Against exact arithmetic: rounding the prior costs rounding over its least eigenvalue."""
     rng = np.random.default_rng(seed)
     P, _, _, H, R = (each[0] for each in ill_conditioned(rng, 1, n, 1))
     exact = np.array(exact_posterior(P, H[0], R[0, 0]), dtype=float)
@@ -154,8 +151,7 @@ def test_an_update_is_as_good_as_the_limit_says(n, seed):
 
 
 def test_a_perfect_component_and_one_repeated():
-    """R with a zero eigenvalue, R slightly below zero by rounding, and two perfect measurements
-    of the same thing: S itself is singular."""
+    """R singular, R slightly below zero, and two perfect measurements: S itself is singular."""
     P = np.tile(np.diag([4.0, 9.0, 1.0]), (3, 1, 1, 1))
     H = np.zeros((3, 1, 2, 3))
     H[:, 0, 0, 0] = 1.0

@@ -99,8 +99,7 @@ def test_a_mistake_of_a_tracker_is_not_taken_for_a_damaged_file():
 
 
 def test_a_full_disk_ends_the_command_with_one_sentence(tmp_path):
-    """A small file system where one may be mounted; else a limit on the size of files, which fails
-    a write in the same way: after the folder and the file were made."""
+    """A small file system where one may be mounted; else a limit on the size of files."""
     mount = ['mount', '-t', 'tmpfs', '-o', 'size=32k', 'tmpfs', str(tmp_path)]
     small = shutil.which('mount') and not subprocess.run(mount, capture_output=True).returncode
     limit = '' if small else 'import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (9, 9));'

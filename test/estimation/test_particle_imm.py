@@ -89,8 +89,7 @@ def test_where_the_state_says_nothing_it_is_the_forward_algorithm(order):
 
 
 def test_static_states_beside_models_are_a_larger_hidden_markov_model():
-    """Which of four bottoms it is never changes, which of three models holds does: twelve states,
-    of which the filter has the models exactly and the bottoms as particles."""
+    """Which of four bottoms it is never changes: twelve states, the bottoms as particles."""
     rng, bottoms = np.random.default_rng(5), np.arange(4.0)
     emission = rng.dirichlet(np.full(5, 0.7), (3, 4))  # of model and bottom, five kinds of echo
     echoes = rng.integers(5, size=12)

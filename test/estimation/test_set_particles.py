@@ -167,8 +167,7 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
 
 @pytest.mark.parametrize('change', [{}, {'shift': Shift(std=1.5, memory=0.9)}, {'jump': JUMP}])
 def test_what_is_kept_of_equal_sets_changes_no_bit(model, exact, change):
-    """Sets that come again, and those that compete for a slot, are moved and weighed as if each
-    came alone."""
+    """Equal sets, and those that compete for a slot, are as if each came alone."""
     changed = evolve(model, negative_probability=0.3, **change)
     tracker, N = SetFilter(changed, 600), 600
     b = np.pad(exact['B'][3], changed.pad)
@@ -269,8 +268,7 @@ def test_nothing_is_corrected_across_a_record_that_nothing_explains(model, exact
 
 
 def test_sets_are_resampled_when_few_of_them_count_and_only_then(model, exact):
-    """Resampling costs variety: below half of the sample it is worth it, above it is not, and the
-    weights are carried on instead."""
+    """Above half of the sample the weights are carried on instead, which keeps variety."""
     tracker, N = SetFilter(model, 400), 400
     known, kept, drawn = None, 0, 0
     for name, b in enumerate(np.concatenate([0.3 * exact['B'], exact['B']])):
@@ -511,9 +509,7 @@ def test_amplitudes_and_shifts_are_forgotten_by_the_time(wide):
 
 @pytest.mark.parametrize('step', [1, 4])
 def test_an_offset_drawn_anew_leaves_its_distribution(step):
-    """Paths of shifts and how likely they are with each offset, by the sum over the grid; drawn
-    from that, offsets drawn anew are distributed as before, also where they are less than a
-    step."""
+    """By the sum over the grid, also where offsets are less than a step."""
     shift, N, rng = Shift(std=3.0, memory=0.6, step=step), 40_000, np.random.default_rng(3)
     innovation = math.sqrt(1.0 - 0.6**2) * 3.0
     grid = shift.places

@@ -159,8 +159,7 @@ def test_before_the_first_record_members_neither_come_nor_go(start):
 @pytest.mark.parametrize('wide', [False, True])
 @pytest.mark.parametrize('all_sums', [False, True])
 def test_walks_are_drawn_by_what_they_come_to(wide, all_sums):
-    """Member by member, for walks of two kinds, of which one has a gap and leads aside; also
-    where it sees a peak that it cannot reach and whose worth is beyond numbers beside others."""
+    """Walks of two kinds, one with a gap and aside; also beside a peak that is out of reach."""
     n, share, rng = 30, 0.8, np.random.default_rng(2)
     g = 8.0 * rng.random((2, n))
     if not wide:

@@ -155,8 +155,7 @@ def test_models_that_are_all_the_same_give_rts_and_the_chain_alone(models):
 
 
 def test_states_drawn_anew_give_the_forward_backward_algorithm():
-    """With F = 0 the models are a hidden Markov chain with Gaussian emissions, here one whose
-    matrices change with time; filter and smoother are both exact."""
+    """With F = 0 the models are a hidden Markov chain: filter and smoother are both exact."""
     rng = np.random.default_rng(4)
     K, M = 12, 3
     F, Q, B = np.zeros((K, M, 2, 2)), covariance(rng, K, M, 2), 1.5 * rng.normal(size=(K, M, 2))
@@ -261,8 +260,7 @@ def random_models(rng, M):
 
 
 def headings(rng, M):
-    """Fixed speed along M headings, the velocity without memory: F has rows of zeros, Q has rank
-    two of four."""
+    """Fixed speed along M headings, no memory: F has rows of zeros, Q has rank two of four."""
     angle = 2 * np.pi * np.arange(M) / M
     u = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     G = np.vstack([np.eye(2), np.eye(2)])
@@ -320,8 +318,7 @@ def enumerated(models, M, K, seed):
 
 
 def distances(states, exact):
-    """Of x, P, mu (K, M, ...) from what is exact, step by step: of probabilities, of the mean in
-    its own standard deviations, of the variance; the last step is left out."""
+    """From what is exact, step by step: of probabilities, of the mean in sigmas, of variance."""
     mean, C, probability = exact
     x, P = imm.combine(*states, repeat(np.eye(mean.shape[-1]), probability.shape[-1]))
     squared = np.einsum('ka,kab,kb->k', x - mean, np.linalg.pinv(C), x - mean)
@@ -342,11 +339,7 @@ def distances(states, exact):
     ],
 )
 def test_close_to_the_enumeration_of_all_sequences(models, M, K, mean_errors, worst_errors):
-    """Twelve scenes: mean errors of the probabilities, of the state in its own sigmas, of its
-    variance; worst ones of a step of state and variance. With two Gaussians per model in the
-    forward pass and one in the backward pass they were some seven times larger, at worst 0.16
-    sigmas and 50 %. The filter, in the same scenes, is further away by a factor of twenty at
-    least."""
+    """Mean and worst errors of twelve scenes; the filter is twenty times as far off, or more."""
     smoothed, filtered = [], []
     for seed in range(12):
         moves, states, exact = enumerated(models, M, K, seed)
@@ -359,8 +352,7 @@ def test_close_to_the_enumeration_of_all_sequences(models, M, K, mean_errors, wo
 
 
 def test_where_the_imm_filter_is_far_off_the_smoother_is_not():
-    """The filter ends 1.7 standard deviations from the exact mean. Its Gaussians do not take the
-    place of better ones, because nothing but its models was mixed into them."""
+    """The filter ends 1.7 sigmas off: its Gaussians do not take the place of better ones."""
     moves, (x, P, mu), exact = enumerated(random_models, 2, 9, 114)
     last = imm.combine(x, P, mu, repeat(np.eye(2), 2))[0][-1] - exact[0][-1]
     assert np.sqrt(last @ np.linalg.solve(exact[1][-1], last)) > 1.5
@@ -397,8 +389,7 @@ def test_the_prediction_is_that_of_an_imm_filter_unless_it_is_given():
 
 
 def test_after_a_step_that_no_measurement_explains_the_filtered_states_count():
-    """An update that widens, as one by two measurements either of which may be the right one. It
-    and what follows are smoothed as if the pass began there."""
+    """An update that widens: it and what follows are smoothed as if the pass began there."""
     rng, K, M = np.random.default_rng(7), 5, 3
     F, Q, B, H, R = quiet_and_agile(rng, M)
     mu, transition = rng.dirichlet(3 * np.ones(M)), chain(rng, M)

@@ -237,8 +237,9 @@ def pings(motion):
         loud = rng.normal(size=(40, 1)) + 1j * rng.normal(size=(40, 1))
         noise = 0.1 * (rng.normal(size=(40, 6)) + 1j * rng.normal(size=(40, 6)))
         found.append(Snapshot(
-            stamp_ns=stamp, range=ranges, iq=loud * np.exp(1j * phase) + noise, side=side_of(motion),
+            stamp_ns=stamp, range=ranges, iq=loud * np.exp(1j * phase) + noise,
             noise_variance=np.full(40, 0.02), frame_id='sonar', sound_speed=1500.0,
+            side=side_of(motion),
         ))  # fmt: skip
     return found
 

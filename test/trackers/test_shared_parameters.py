@@ -92,8 +92,7 @@ def test_an_origin_is_three_numbers_on_earth(kind):
 
 
 def test_a_parameter_may_change_in_all_systems_or_in_none():
-    """Pings of the bathymetry tracker share no state: everything may change there but the frames,
-    whose transform is looked for once."""
+    """Pings of the bathymetry tracker share no state: all may change there but the frames."""
     flags: dict[str, set[bool]] = {}
     for name, system in SYSTEMS.items():
         specs = system.config_type().specs()

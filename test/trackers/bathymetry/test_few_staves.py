@@ -65,8 +65,7 @@ def test_a_floor_that_they_see_differently_is_followed_when_told():
 
 
 def test_a_lobe_beside_the_floor_is_not_taken_for_one():
-    """Seen by two staves far apart a level floor is a slope in the next lobe, too: of these pings
-    one begins there when the start is one Gaussian."""
+    """A level floor is a slope in the next lobe, too: one ping began there from one Gaussian."""
     config = scenario('paper', {**WIDE, 'pings': 5, 'decorrelation': 0.2, 'patch_std': 0.0})
     tracker = BathymetryTracker(
         BathymetryConfig.from_mapping({**config.instruments(), 'decorrelation': 0.2})

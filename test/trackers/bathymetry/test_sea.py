@@ -275,8 +275,7 @@ def tracked(config, measurements):
 
 
 def test_a_heading_that_passes_through_180_degrees_is_no_jump():
-    """The heading of the case, about 30 degrees, put to south; and quaternions that change their
-    sign, which says nothing."""
+    """The heading of the case put to south; and quaternions that change their sign."""
     config = sea_config(CASE)
     poses, pings = navigation(CASE), list(snapshots(CASE))[:3]
     plain = tracked(config, [*poses, *pings])

@@ -324,8 +324,7 @@ def test_half_of_the_log_likelihood_is_what_a_factor_says():
 
 
 def test_what_favours_a_model_counts_once():
-    """Before the last bin only the outward filter has been there: the share of a model there is
-    multiplied by the factor, not by its square."""
+    """Its share before the last bin is multiplied by the factor, not by its square."""
     ranges = 20.0 + 0.05 * np.arange(60)
     ping = look(Ping(TERRAIN, floor(0.0, ranges=ranges), None))
     peak = ping.swath.height_from(ping.loudest)

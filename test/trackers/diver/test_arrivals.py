@@ -108,8 +108,7 @@ def many_receivers(
 
 @pytest.mark.parametrize('passive', [False, True])
 def test_bearings_of_many_receivers_across_half_a_turn_are_bearings(passive):
-    """Eight receivers are more than subsets are tried of: heavy tails. Turned by pi, the diver
-    crosses the direction in which their bearings jump from pi to -pi."""
+    """Heavy tails; turned by pi, the diver crosses where bearings jump from pi to -pi."""
     depth = {'target_z': -2.0, 'adaptation': 'fixed', 'passive': passive, 'seconds': range(9, 25)}
     plain, divers, _ = many_receivers(0.0, **depth)
     other, turned, _ = many_receivers(np.pi, **depth)
@@ -209,8 +208,7 @@ def test_positions_as_a_sensor_shows_them_are_turned_about_it_and_back():
 
 @pytest.mark.parametrize('association', ['gnn', 'jipda'])
 def test_a_considered_bearing_widens_the_ellipse_across_and_moves_no_estimate(association):
-    """What is added is the variance of the bearing times the distance squared, in the direction in
-    which an error of the bearing moves the diver, as in closed form."""
+    """By the variance of the bearing times the distance squared, across the line of sight."""
     config = {**SINGLE, 'association': association}
     plain, _ = last(config, path())
     wide, known = last({**config, 'bearing_bias_std_deg': 2.0}, path())
@@ -232,8 +230,7 @@ def test_where_nobody_knows_where_a_sensor_stands_nothing_is_added():
 
 
 def around_a_diver(off):
-    """A diver who lies still, seen from a vessel that circles him, its transceiver mounted wrong
-    by `off` rad."""
+    """A diver who lies still, seen from a vessel that circles, its transceiver `off` rad off."""
     rng, where, made = np.random.default_rng(5), np.array([10.0, 5.0, 0.0]), []
     turn = np.array([[np.cos(off), -np.sin(off), 0.0], [np.sin(off), np.cos(off), 0.0], [0, 0, 1]])
     for k in range(1, 90):

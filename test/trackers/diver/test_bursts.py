@@ -236,8 +236,7 @@ def test_a_burst_among_several_divers_takes_no_identity():
 
 
 def test_a_burst_excludes_a_track_though_its_second_fix_is_missing():
-    """The track that the first fix begins does not end before the burst, or a new target would be
-    lost to it."""
+    """What its first fix begins does not end before it: a new target would be lost to it."""
     t = np.arange(60.0)
     truth = np.column_stack([0.5 * t - 20.0, 0.0 * t])[:, None]
     seen = truth.copy()

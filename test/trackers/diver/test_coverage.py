@@ -112,8 +112,7 @@ def test_existence_of_a_diver_who_is_not_seen_is_the_closed_recursion(tmp_path):
 
 
 def test_existence_at_the_edge_is_that_of_particles_told_the_true_probability():
-    """A diver who swims out of the sector, and is not seen any more: 40,000 particles with the
-    motion of the tracker, weighed by 1 - p(x) with each empty scan."""
+    """40,000 particles with the motion of the tracker, weighed by 1 - p(x) with each scan."""
     config = DiverConfig(
         association='jipda', model_set='linear', acceleration_noise=(0.1,), coverage_sector=AHEAD
     )

@@ -110,8 +110,7 @@ def test_a_velocity_goes_to_the_headings_it_may_have(models):
 
 
 def test_a_run_is_that_of_the_prototype(monkeypatch):
-    """Its transitions are taken at a step rounded to a microsecond, and are not learnt; who stands
-    keeps his pace; every scale keeps its row."""
+    """Its steps are rounded and not learnt; who stands keeps his pace, each scale its row."""
     monkeypatch.setattr(sets, 'SPEED_MEMORY', 1e12)
     monkeypatch.setattr(rows, 'ROW_LOST', 1e-300)
     fixed = {'association': 'gnn', 'adaptation': 'fixed', 'confirm_hits': 1}
@@ -134,8 +133,7 @@ def test_a_run_is_that_of_the_prototype(monkeypatch):
 
 
 def test_who_stood_for_minutes_goes_on_at_a_pace_of_his_own(monkeypatch):
-    """Fixes half a minute apart, worse where he goes on, as of a towed tag (docs/results/
-    recordings.md): who keeps the crawl that was learnt while he stood stays behind."""
+    """Fixes half a minute apart, as of a towed tag: who keeps the crawl stays behind."""
 
     def errors():
         rng, tracker, out = np.random.default_rng(4), DiverTracker(config(association='gnn')), []
@@ -208,8 +206,7 @@ def test_scales_below_one_say_where_the_diver_is_but_not_how_well_that_is_known(
 
 
 def test_what_is_stated_and_how_far_the_rows_are_apart(monkeypatch):
-    """With a row below 1 the published covariance is that of the tracker without it, and the
-    square of how far the two means are apart; NIS and scale are those without it."""
+    """A row below 1 adds the square of how far the means are apart; NIS and scale stay."""
     monkeypatch.setattr(rows, 'ROW_LOST', 1e-300)
     items, runs = path(60, std=0.4, scale=6.0), []
     for scales in ((0.15, 1.0, 3.0, 10.0), (1.0, 3.0, 10.0)):

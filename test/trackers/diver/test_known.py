@@ -118,8 +118,7 @@ def test_tracks_in_one_table_are_trackers_of_one(settings):
 def test_rows_that_lost_their_weight_would_have_said_nothing_else(
     association, scatter, monkeypatch
 ):
-    """Estimates are those of a tracker that computes every scale, to a thousandth of a standard
-    deviation as a rule, and never to more than a tenth."""
+    """A tracker that computes every scale gives the same to a tenth of a standard deviation."""
     config = DiverConfig(max_tracks=5, association=association)
     items = list(scans(2, 60, 7, apart=25.0, scatter=scatter))
     trackers, off, wide = [DiverTracker(config) for _ in range(2)], [], []

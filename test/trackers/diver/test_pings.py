@@ -192,8 +192,7 @@ def test_many_good_arrivals_outvote_any_prior():
 
 @pytest.mark.parametrize('std', [1.0, 1e2, 1e6, 1e9])
 def test_exact_arrivals_at_twin_receivers_are_judged_whatever_was_known(std):
-    """What is expected at two receivers in one place is the same to the last bit. After a long
-    silence it is so uncertain that the variances of the arrivals are lost in its rounding."""
+    """After a long silence the variances of the arrivals are lost in the rounding."""
     config = DiverConfig(max_tracks=1)
     models = build_models(config)
     layout = Instruments().layout(config, models)
@@ -289,8 +288,7 @@ def test_the_same_depth_report_beside_every_arrival_is_one_measurement():
 
 
 def test_a_search_begins_on_the_ellipse_of_the_shortest_path():
-    """Where the sum of the ways is the path that was heard first: anywhere else the first echo is
-    late or early by what the search has to find."""
+    """Anywhere else the first echo is late or early by what the search has to find."""
     config = DiverConfig(max_tracks=1)
     models = build_models(config)
     layout = Instruments().layout(config, models)

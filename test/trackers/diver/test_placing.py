@@ -336,8 +336,7 @@ def test_relative_positions_far_from_the_origin_are_exact_up_to_88_degrees(latit
 
 @pytest.mark.parametrize('levelled', [False, True])
 def test_magnetic_north_is_turned_to_true_north(levelled):
-    """Magnetic north lies 20 degrees east of true north: what a compass shows as due north is at
-    20 degrees clockwise."""
+    """20 degrees east of it: what a compass shows as due north is at 20 degrees clockwise."""
     stated = {'origin': (70.0, 10.0, 0.0), **EXACT}
     config = DiverConfig(magnetic_declination_deg=20.0, **stated)
     ahead = (0.0, 500.0, 0.0) if levelled else (500.0, 0.0, 0.0)

@@ -358,8 +358,7 @@ def test_warnings_of_fixes_need_evidence_and_a_bias_that_is_not_stated():
 
 
 def beside_each_other(seed, seen, std=0.15, detection_probability=0.95, clutter=0.0):
-    """Scans of divers 0.4 m apart, as many as `seen` says for each second, in clutter (fixes in a
-    square of 50 m)."""
+    """Scans of divers 0.4 m apart, as many as `seen` says each second, in a square of 50 m."""
     rng = np.random.default_rng(seed)
     for second, count in enumerate(seen, start=1):
         places = np.array([[0.5 * second, 0.4 * number] for number in range(count)])

@@ -231,8 +231,7 @@ def test_without_anything_stated_no_state_is_added():
 
 @pytest.mark.parametrize('options', [{'sound_speed_std': 15.0}, OFF])
 def test_a_fix_before_any_ping_begins_a_track(options) -> None:
-    """Instruments that are off have their place in the state before a ping is heard; `warm` needs
-    it at every start."""
+    """Instruments have their place in the state before a ping; `warm` needs it at every start."""
     tracker = DiverTracker(DiverConfig(**options))
     tracker.warm()
     (estimate,) = tracker.process(fix(1.0, 3.0, 4.0))

@@ -196,8 +196,7 @@ def test_smoothing_lowers_the_error_and_keeps_the_tracks():
 
 
 def test_a_long_gap_is_no_straight_line():
-    """The spread predicted over half a minute is that of divers who turn as the chain says, not
-    that of divers who pick a heading and keep it."""
+    """The spread over half a minute is that of divers who turn as the chain says."""
     rng = np.random.default_rng(11)
     config = DiverConfig(
         model_set='heading_speed',

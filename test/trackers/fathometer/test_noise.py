@@ -99,8 +99,7 @@ def test_noise_near_an_array_that_hears_itself_is_louder_there_and_nowhere_else(
 
 @pytest.mark.parametrize('half, expected', [(np.inf, 3.3), (40.0, 1.0), (9.0, 1.0)])
 def test_the_mirror_window_ends_at_half_a_snapshot(half, expected):
-    """Further away are the lags of the other side, here five times as loud: seen
-    without a limit, as the median of both."""
+    """Further away are the lags of the other side, here five times as loud."""
     rng = np.random.default_rng(2)
 
     def other_side(low, step, count):

@@ -120,8 +120,7 @@ def test_the_course_is_as_sure_as_its_default_says():
 
 
 def test_the_tracker_says_what_an_independent_one_does():
-    """At the pings for which it told, with its `course_std` and navigation without errors that
-    last; its course is made a little differently."""
+    """With its `course_std` and navigation without errors that last."""
     off = {'cpa_distance': [], 'cpa_time': [], 'collision_probability': []}
     for name, number in ENCOUNTERS:
         data, estimates = tracked(name, number, course_std=0.05, **EXACT)

@@ -66,8 +66,7 @@ def test_movers_are_followed_through_clutter():
 
 
 def test_crossing_in_clutter_while_another_is_born():
-    """Nothing is given: echoes are missed, three in a ping are false, and a third obstacle comes
-    into view when the two pass each other."""
+    """Echoes are missed, three in a ping are false, a third obstacle comes into view."""
     from helpers.obstacle_crossing import crossing
 
     estimates, true = crossing(detected=0.9, clutter=3.0, late=30)

@@ -151,9 +151,7 @@ def image_run(setting, seed):
 
 @pytest.mark.statistics
 def test_tracks_of_images_are_as_good_as_they_say():
-    """Floats of half a metre in images of a small sonar, 24 scenes. Each image says how far glints
-    are apart, which does not tell how far the centroid is off: taken at its word the whole-state
-    NEES of these scenes is several times what it should be."""
+    """24 scenes: how far glints are apart does not tell how far the centroid is off."""
     setting = scenario(
         'images',
         {

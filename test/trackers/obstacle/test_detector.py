@@ -60,8 +60,7 @@ def test_five_targets_are_five_clusters_where_they_are():
 
 
 def test_the_answers_are_those_of_an_independent_detector():
-    """Where a target is one cluster of both; the chain is not, of which the study's has one
-    glint."""
+    """Where a target is one cluster of both; of the chain the study's has one glint."""
     picture, study = study_image()
     found = detect(picture, DetectorConfig())
     for r, b, db in zip(study['ref_range'], study['ref_bearing'], study['ref_snr_db']):

@@ -82,8 +82,7 @@ class Grid:
 @pytest.mark.statistics
 @pytest.mark.parametrize('offset, echoes', [(-2.5, 18), (-1.5, 35), (4.0, 32)])
 def test_an_obstacle_is_believed_where_an_exact_grid_filter_believes_it(offset, echoes):
-    """A sonar that looks down by 3 degrees on a level path: ranges say how far off an obstacle
-    lies and nothing of the side; where it is no longer seen tells."""
+    """Looking down by 3 degrees: where it is no longer seen tells the side."""
     pitch, step = np.radians(-3.0), 0.75
     turned = geometry.rotation(0.0, pitch, 0.0)
     config = ObstacleConfig(behaviours=('fixed',), components=41, **STILL)

@@ -131,8 +131,7 @@ def test_mixing_leaves_depth_slices_alone_and_drops_the_improbable():
 
 @pytest.mark.parametrize('kind', ['swaying', 'moving'])
 def test_covariance_of_a_step_equals_sampling(kind):
-    """The cross covariance of position and e, and the sign of ``step``, show here and nowhere in
-    the error of an offset."""
+    """The cross covariance of position and e, and the sign of ``step``, show here only."""
     rng = np.random.default_rng(5)
     filter_ = BehaviourSlices(
         ObstacleConfig(

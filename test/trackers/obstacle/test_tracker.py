@@ -93,8 +93,7 @@ def test_conventions_of_sonars(model, timing):
 
 @pytest.mark.statistics
 def test_the_offset_is_found_and_is_as_good_as_it_says():
-    """Error, variance, band and P(above) of twelve approaches each, at 30 m, with navigation that
-    is known to have no errors that last, as in the scenes."""
+    """Error, variance, band and P(above) of twelve approaches each, at 30 m."""
     found = {}
     for name, most in {'approach': 1.7, 'above': 1.8, 'rolling': 0.8}.items():
         results = [offset_at(*track_scene(name, seed, **EXACT), 30.0) for seed in range(12)]
@@ -265,8 +264,7 @@ def test_the_probability_of_a_detection_falls_with_range():
 
 
 def test_misses_count_where_the_sonar_would_see():
-    """An obstacle 55 m ahead, surely in the beam, of a vehicle that stands still gives six echoes
-    and then none for ten seconds: to be expected of a sonar that hardly sees that far."""
+    """55 m ahead, six echoes and then none: expected of a sonar that hardly sees that far."""
     ended = {}
     for values in ({}, FALLS):
         tracker = ObstacleTracker(ObstacleConfig(max_offset=2.0, **values))

@@ -196,8 +196,7 @@ def tracks_of(estimates):
 
 @pytest.mark.parametrize('name, number', ENCOUNTERS)
 def test_answers_are_those_of_an_independent_filter(name, number):
-    """That filter knows how far obstacles sway and ours does not: they differ more while one
-    begins to move."""
+    """It knows how far obstacles sway: while one begins to move they differ more."""
     data, estimates = tracked(name, number, **EXACT)
     assert tracks_of(estimates) == {1}
     pings = np.arange(SETTLED, len(estimates))
