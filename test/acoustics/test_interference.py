@@ -45,16 +45,9 @@ def test_the_compiled_likelihood_is_that_of_linear_algebra(scene, likelihood):
     out = np.empty(len(u))
     for n in range(3):
         grid_kernels.log_likelihoods(
-            u,
-            SPACING,
-            -signal * form.beam[n],
-            form.base[n],
-            form.spread[n],
-            signal,
-            laplace.likelihood_table(STAVES, likelihood),
-            np.empty((4, len(u))),
-            out,
-        )
+            u, SPACING, -signal * form.beam[n], form.base[n], form.spread[n], signal,
+            laplace.likelihood_table(STAVES, likelihood), np.empty((4, len(u))), out,
+        )  # fmt: skip
         expected = interfered_log_likelihood(u, y[n], signal, covariance[n], STEP, likelihood)
         assert out[-1] == expected[-1] == -np.inf
         assert np.allclose(out[:-1], expected[:-1], rtol=3e-7, atol=1e-6)

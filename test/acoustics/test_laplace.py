@@ -159,16 +159,9 @@ def test_the_compiled_likelihood_is_that_of_numpy(staves, spacing, likelihood):
     y, signal, noise = 3.0 * complex_normal(rng, staves), 40.0, 0.7
     out = np.empty(len(u))
     grid_kernels.log_likelihoods(
-        u,
-        spacing,
-        laplace.form_coefficients(y, signal, noise),
-        0.0,
-        np.empty(0, complex),
-        0.0,
-        laplace.likelihood_table(staves, likelihood),
-        np.empty((4, len(u))),
-        out,
-    )
+        u, spacing, laplace.form_coefficients(y, signal, noise), 0.0, np.empty(0, complex), 0.0,
+        laplace.likelihood_table(staves, likelihood), np.empty((4, len(u))), out,
+    )  # fmt: skip
     expected = log_likelihood(u, y, signal, noise, 2.0 * math.pi * spacing, likelihood)
     assert out[300] == expected[300] == -np.inf
     fine = np.arange(len(u)) != 300

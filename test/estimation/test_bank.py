@@ -25,12 +25,9 @@ A = int((MIXING['kind'] != 1).sum())
 HOVER = MIXING['kind'][ORDER][:A] == 2
 UNITS = np.where(HOVER, 0.0, MIXING['heading'][ORDER][:A].T)
 BANK = Bank(
-    UNITS,
-    velocities=3,
-    speed=float(MIXING['speed_mean']),
-    speed_variance=float(MIXING['speed_variance']),
-    sector=float(MIXING['sector_variance']),
-)
+    UNITS, velocities=3, speed=float(MIXING['speed_mean']),
+    speed_variance=float(MIXING['speed_variance']), sector=float(MIXING['sector_variance']),
+)  # fmt: skip
 
 
 def blocks_of(x, P):

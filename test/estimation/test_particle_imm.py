@@ -71,13 +71,10 @@ def test_where_the_state_says_nothing_it_is_the_forward_algorithm(order):
         return lambda x, k: np.full(len(x), math.log(likelihood[k, j]))
 
     tracker = ParticleIMM(
-        {names[j]: still for j in order},
-        T[np.ix_(order, order)],
-        rng.normal(size=(50, 2)),
-        {names[j]: sensor(j) for j in reversed(order)},
-        rng,
+        {names[j]: still for j in order}, T[np.ix_(order, order)], rng.normal(size=(50, 2)),
+        {names[j]: sensor(j) for j in reversed(order)}, rng,
         initial=np.array([0.2, 0.5, 0.3])[order],
-    )
+    )  # fmt: skip
     assert tracker.names == tuple(names[order])
     for k in range(30):
         tracker.step(None if k in (7, 8) else k)
@@ -131,12 +128,9 @@ def test_one_linear_model_is_the_kalman_filter():
     for _ in range(count):
         truth, P = rng.normal(size=2), np.eye(2)
         tracker = ParticleIMM(
-            {'cv': lambda x, rng, dt: x @ F.T + rng.normal(size=x.shape) @ root.T},
-            [[1.0]],
-            rng.normal(size=(3000, 2)),
-            normal(1.0),
-            rng,
-        )
+            {'cv': lambda x, rng, dt: x @ F.T + rng.normal(size=x.shape) @ root.T}, [[1.0]],
+            rng.normal(size=(3000, 2)), normal(1.0), rng,
+        )  # fmt: skip
         x = np.zeros(2)
         log = 0.0
         for _ in range(10):
@@ -189,12 +183,9 @@ Z = np.array([0.1, -0.3, 0.4, 1.7, 2.2, 2.5, 3.9, 4.0])
 def particle_run(seed, transition=TWO, order=(0, 1), count=2000):
     rng = np.random.default_rng(seed)
     tracker = ParticleIMM(
-        {f'm{j}': walk(*MODES[j]) for j in order},
-        transition[np.ix_(order, order)],
-        rng.normal(size=(count, 1)),
-        normal(0.25),
-        rng,
-    )
+        {f'm{j}': walk(*MODES[j]) for j in order}, transition[np.ix_(order, order)],
+        rng.normal(size=(count, 1)), normal(0.25), rng,
+    )  # fmt: skip
     total = 0.0
     for z in Z:
         tracker.step(z)
@@ -249,12 +240,9 @@ def test_a_measurement_that_nothing_explains_changes_nothing():
 def test_a_model_that_cannot_be_comes_back_when_the_chain_allows():
     rng = np.random.default_rng(2)
     tracker = ParticleIMM(
-        {'a': walk(0.1), 'b': walk(0.1)},
-        [[0.9, 0.1], [0.2, 0.8]],
-        rng.normal(size=(100, 1)),
-        {'a': lambda x, z: np.full(len(x), -np.inf), 'b': normal(1.0)},
-        rng,
-    )
+        {'a': walk(0.1), 'b': walk(0.1)}, [[0.9, 0.1], [0.2, 0.8]], rng.normal(size=(100, 1)),
+        {'a': lambda x, z: np.full(len(x), -np.inf), 'b': normal(1.0)}, rng,
+    )  # fmt: skip
     for z in (0.0, 0.1, -0.1):
         tracker.step(z)
         assert tracker.model_probabilities.tolist() == [0.0, 1.0]

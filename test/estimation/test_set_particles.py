@@ -204,15 +204,9 @@ def test_the_likelihood_is_that_of_the_whole_record():
     residual = y - A @ a
     full = 0.5 * (y @ np.linalg.solve(G, y) - residual @ np.linalg.solve(G, residual)) / sigma**2
     model = SetModel(
-        cells=n,
-        separation=2,
-        order_min=3,
-        transition=[[1.0]],
-        walk=gaussian_walk(1.0),
-        gram=gram,
-        amplitude_prior='bic_half',
-        independent_samples=1.0,
-    )
+        cells=n, separation=2, order_min=3, transition=[[1.0]], walk=gaussian_walk(1.0), gram=gram,
+        amplitude_prior='bic_half', independent_samples=1.0,
+    )  # fmt: skip
     sets = Sets.empty(model, 1)
     sets.order[:], sets.cell[0] = 3, places
     log_likelihood, amplitude = weigh(model, y / sigma, sets)
@@ -222,14 +216,9 @@ def test_the_likelihood_is_that_of_the_whole_record():
 
 def test_marginal_amplitudes_are_integrated_out():
     model = SetModel(
-        cells=5,
-        separation=1,
-        order_min=1,
-        transition=[[1.0]],
-        walk=gaussian_walk(0.5),
-        gram=np.eye(1, 5)[0],
-        amplitude_std=2.0,
-    )
+        cells=5, separation=1, order_min=1, transition=[[1.0]], walk=gaussian_walk(0.5),
+        gram=np.eye(1, 5)[0], amplitude_std=2.0,
+    )  # fmt: skip
     b = np.array([0.0, 0.0, 1.7, 0.0, 0.0])
     sets = Sets.empty(model, 1)
     sets.order[:], sets.cell[0] = 1, 2
@@ -392,13 +381,9 @@ CELLS, SETS = 400, 20_000
 @pytest.fixture
 def wide():
     return SetModel(
-        cells=CELLS,
-        separation=2,
-        order_min=1,
-        transition=banded_transition(4, 0.1),
-        walk=gaussian_walk(2.0),
-        gram=np.exp(-0.5 * (np.arange(CELLS) / 1.5) ** 2),
-    )
+        cells=CELLS, separation=2, order_min=1, transition=banded_transition(4, 0.1),
+        walk=gaussian_walk(2.0), gram=np.exp(-0.5 * (np.arange(CELLS) / 1.5) ** 2),
+    )  # fmt: skip
 
 
 def test_the_sum_of_walks_is_their_convolution():

@@ -92,12 +92,9 @@ def test_rts_equals_the_joint_gaussian(seed):
     K, n = 8, 3
     F, Q, B = rng.normal(size=(K, n, n)) * 0.7, covariance(rng, K, n), rng.normal(size=(K, n))
     H, R, x0, P0, Z = (
-        rng.normal(size=(2, n)),
-        covariance(rng, 2),
-        rng.normal(size=n),
-        covariance(rng, n),
+        rng.normal(size=(2, n)), covariance(rng, 2), rng.normal(size=n), covariance(rng, n),
         rng.normal(size=(K, 2)),
-    )
+    )  # fmt: skip
     x, P = rts_smooth(*kalman_pass(F, Q, B, H, R, x0, P0, Z), F, Q, B)
     expected_x, expected_P = joint_by_covariance(F, Q, B, H, R, x0, P0, Z)
     np.testing.assert_allclose(x, expected_x, rtol=1e-7, atol=1e-8)
@@ -112,15 +109,9 @@ def test_rts_with_a_velocity_without_memory_and_without_noise(noise):
     F[0, 2] = 0.3
     B, H, R = np.array([0.4, 0.1, 0.4, 0.1]), np.eye(2, 4), np.diag([1.0, 2.0])
     arguments = (
-        repeat(F, K),
-        repeat(Q, K),
-        repeat(B, K),
-        H,
-        R,
-        np.zeros(4),
-        np.eye(4),
+        repeat(F, K), repeat(Q, K), repeat(B, K), H, R, np.zeros(4), np.eye(4),
         rng.normal(size=(K, 2)),
-    )
+    )  # fmt: skip
     x, P = rts_smooth(*kalman_pass(*arguments), repeat(F, K), repeat(Q, K), repeat(B, K))
     expected_x, expected_P = joint_by_covariance(*arguments)
     np.testing.assert_allclose(x, expected_x, atol=1e-9)
@@ -219,12 +210,8 @@ def enumerate_sequences(F, Q, B, H, R, x, P, mu, transition, Z):
     K, M = len(Z), len(mu)
     sequences = np.array(list(itertools.product(range(M), repeat=K)))
     log_weight, x, P, xs, Ps = (
-        np.log(mu[sequences[:, 0]]),
-        x[sequences[:, 0]],
-        P[sequences[:, 0]],
-        [],
-        [],
-    )
+        np.log(mu[sequences[:, 0]]), x[sequences[:, 0]], P[sequences[:, 0]], [], [],
+    )  # fmt: skip
     for k in range(K):
         now = sequences[:, k]
         if k:
@@ -251,12 +238,9 @@ def enumerate_sequences(F, Q, B, H, R, x, P, mu, transition, Z):
 def random_models(rng, M):
     F = np.stack([[[1.0, 1.0], [0.0, rng.uniform(0, 1)]] for _ in range(M)])
     return (
-        F,
-        0.1 * covariance(rng, M, 2),
-        rng.normal(size=(M, 2)),
-        np.array([[1.0, 0.0]]),
+        F, 0.1 * covariance(rng, M, 2), rng.normal(size=(M, 2)), np.array([[1.0, 0.0]]),
         0.5 * np.eye(1),
-    )
+    )  # fmt: skip
 
 
 def headings(rng, M):
@@ -265,12 +249,9 @@ def headings(rng, M):
     u = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     G = np.vstack([np.eye(2), np.eye(2)])
     return (
-        repeat(np.diag([1.0, 1.0, 0.0, 0.0]), M),
-        repeat(0.19**2 * G @ G.T, M),
-        np.hstack([u, u]),
-        np.eye(2, 4),
-        np.eye(2),
-    )
+        repeat(np.diag([1.0, 1.0, 0.0, 0.0]), M), repeat(0.19**2 * G @ G.T, M), np.hstack([u, u]),
+        np.eye(2, 4), np.eye(2),
+    )  # fmt: skip
 
 
 def quiet_and_agile(rng, M):

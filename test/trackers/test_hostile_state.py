@@ -69,29 +69,11 @@ def memory():
 
 
 GADGETS = [
-    'subprocess.Popen',
-    'Popen',
-    'os.system',
-    'antigravity',
-    'sonar_imm.trackers.diver.tracker.DiverTracker',
-    'DiverTracker',
-    'DiverConfig',
-    'ReplayStream',
-    'KnownFrames',
-    'Decoder',
-    'Saved',
-    'Path',
-    'type',
-    'object',
-    'Trap',
-    'test_hostile_state.Trap',
-    'Origin',
-    '',
-    5,
-    None,
-    ['Fix'],
-    {'class': 'Fix'},
-]
+    'subprocess.Popen', 'Popen', 'os.system', 'antigravity',
+    'sonar_imm.trackers.diver.tracker.DiverTracker', 'DiverTracker', 'DiverConfig', 'ReplayStream',
+    'KnownFrames', 'Decoder', 'Saved', 'Path', 'type', 'object', 'Trap', 'test_hostile_state.Trap',
+    'Origin', '', 5, None, ['Fix'], {'class': 'Fix'},
+]  # fmt: skip
 """Classes and more that modules lead to, and that do not stand in a state, or not there."""
 
 

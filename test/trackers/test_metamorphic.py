@@ -112,13 +112,10 @@ def divers(motion, order=(0, 1), receivers=(0, 1, 2, 3)):
             rx = motion.point(RX)[list(receivers)]
             found.append(
                 arrivals(
-                    stamp,
-                    np.repeat(rx, 2, axis=0),
-                    toa[list(receivers)].ravel(),
-                    rx_id=np.repeat(receivers, 2),
-                    tx=motion.point(RX[0]),
+                    stamp, np.repeat(rx, 2, axis=0), toa[list(receivers)].ravel(),
+                    rx_id=np.repeat(receivers, 2), tx=motion.point(RX[0]),
                 )
-            )
+            )  # fmt: skip
             continue
         R = np.tile(motion.covariance(np.array([[0.2, 0.05], [0.05, 0.1]])), (2, 1, 1))
         moved = motion.point(at)[list(order)]

@@ -64,15 +64,11 @@ def test_arrays_come_back_as_they_were():
     owner, again, arrays = Owner(), Owner(), {}
     again.arrays, again.numbers = [], []
     owner.arrays = [
-        np.asfortranarray(np.arange(6.0).reshape(2, 3)),
-        np.arange(200.0).reshape(2, 100).T,
-        np.arange(400, dtype=np.complex64)[::2],
-        np.array([], np.uint16),
-        np.zeros((0, 4)),
-        np.array(['a', 'bcd']),
-        np.array([True, False] * 50),
+        np.asfortranarray(np.arange(6.0).reshape(2, 3)), np.arange(200.0).reshape(2, 100).T,
+        np.arange(400, dtype=np.complex64)[::2], np.array([], np.uint16), np.zeros((0, 4)),
+        np.array(['a', 'bcd']), np.array([True, False] * 50),
         np.array([np.nan, -np.nan, np.inf, -0.0]),
-    ]
+    ]  # fmt: skip
     owner.numbers = [float('nan'), 1 << 63, -0.0, 0.1, np.float64(0.1), np.int64(5)]
     data = encoded(frozen_state(owner), 'x', arrays)
     owner.arrays[0][:] = 9.0  # what happens afterwards changes nothing

@@ -124,12 +124,9 @@ def test_decorrelation_is_noise_that_grows_with_the_echo():
     config = scenario('paper', {'pings': 1, 'last_range': 20.0})
     ping = simulate(config, 1).measurements[0].measurement
     given = BathymetryConfig(
-        model_set='height_two_rw',
-        decorrelation=0.25,
-        engine='grid',
-        gate_false_alarm=1.0,
+        model_set='height_two_rw', decorrelation=0.25, engine='grid', gate_false_alarm=1.0,
         sound_speed_std=2.0,
-    )
+    )  # fmt: skip
     each = BathymetryTracker(given).process(ping)[0]
     signal = np.maximum(
         np.convolve(np.square(np.abs(ping.iq)).mean(axis=1), np.ones(21), 'same')
@@ -138,12 +135,9 @@ def test_decorrelation_is_noise_that_grows_with_the_echo():
         0.01,
     )
     stated = type(ping)(
-        stamp_ns=ping.stamp_ns,
-        range=ping.range,
-        iq=ping.iq,
-        noise_variance=1.0 + 0.25 * signal,
+        stamp_ns=ping.stamp_ns, range=ping.range, iq=ping.iq, noise_variance=1.0 + 0.25 * signal,
         signal_variance=0.75 * signal,
-    )
+    )  # fmt: skip
     same = BathymetryTracker(evolve(given, decorrelation=0.0)).process(stated)[0]
     assert each.state == pytest.approx(same.state, abs=1e-9)
     assert each.covariance == pytest.approx(same.covariance, abs=1e-9)

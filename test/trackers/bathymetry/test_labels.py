@@ -51,12 +51,9 @@ def test_the_error_of_one_snapshot_is_that_of_the_reference_ping():
     r = case['r']
     decibels = 30.0 - 20.0 * np.log(r / 17.0) / np.log(77.0 / 17.0)
     snapshot = Snapshot(
-        stamp_ns=1,
-        range=r,
-        iq=(y[..., 0] + 1j * y[..., 1]).astype(np.complex64),
-        noise_variance=np.ones(len(r)),
-        signal_variance=10.0 ** (0.1 * decibels),
-    )
+        stamp_ns=1, range=r, iq=(y[..., 0] + 1j * y[..., 1]).astype(np.complex64),
+        noise_variance=np.ones(len(r)), signal_variance=10.0 ** (0.1 * decibels),
+    )  # fmt: skip
     seen = look(Ping(TERRAIN, snapshot, None))
     std = seen.swath.snapshot_std(
         seen.swath.floor(np.zeros(len(r)), np.ones(len(r))).angle,

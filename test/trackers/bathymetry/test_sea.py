@@ -94,17 +94,10 @@ def test_a_floor_out_of_reach_is_impossible_not_unknown():
     T, P = 2, 8
     g = level_geometry(np.full(T, 20.0), 15.0, 0.5, 0.5)
     ping = PingLikelihood(
-        ranges=np.full(T, 20.0),
-        echo=np.ones(T, bool),
-        form=np.ones((T, P), complex),
-        base=np.zeros(T),
-        spread=np.empty((T, 0), complex),
-        signal=np.ones(T),
-        noise=np.ones(T),
-        constant=np.zeros(T),
-        table=likelihood_table(P, 'laplace'),
-        geometry=g,
-    )
+        ranges=np.full(T, 20.0), echo=np.ones(T, bool), form=np.ones((T, P), complex),
+        base=np.zeros(T), spread=np.empty((T, 0), complex), signal=np.ones(T), noise=np.ones(T),
+        constant=np.zeros(T), table=likelihood_table(P, 'laplace'), geometry=g,
+    )  # fmt: skip
     state, out = np.array([-6.0, 0.0, 36.0, np.nan, np.inf]), np.empty(5)
     log_likelihoods(state, ping, 0, np.empty(5), np.empty((4, 5)), out)
     assert np.isfinite(out[1]) and np.isneginf(out[[0, 2, 3, 4]]).all()
@@ -173,12 +166,9 @@ def test_a_pose_from_more_than_an_hour_ahead_is_not_believed(seconds, used):
 
 def test_the_altitude_replaces_the_height_for_the_start():
     config = sea_config(
-        CASE,
-        navigation='required',
-        sonar_height=100.0,
-        initial_std=0.3,
+        CASE, navigation='required', sonar_height=100.0, initial_std=0.3,
         model_set='height_two_rw',
-    )
+    )  # fmt: skip
     tracker = BathymetryTracker(config)
     for pose in navigation(CASE):
         tracker.process(pose)

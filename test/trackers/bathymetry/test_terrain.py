@@ -103,19 +103,10 @@ def of_one(mean, std, width=0.05, **changed):
 def of_several(terrain, mean, std):
     M = len(terrain.names)
     return TerrainModels(
-        names=terrain.names,
-        state_names=('height',),
-        F=np.ones((M, 1, 1)),
-        G=np.zeros((M, 1, 1)),
-        scale=np.zeros((1, M)),
-        transition=terrain.transition,
-        initial=terrain.stationary,
-        mean=np.array([mean]),
-        std=np.array([std]),
-        coast=0,
-        rough=terrain.rough,
-        terrain=terrain,
-    )
+        names=terrain.names, state_names=('height',), F=np.ones((M, 1, 1)), G=np.zeros((M, 1, 1)),
+        scale=np.zeros((1, M)), transition=terrain.transition, initial=terrain.stationary,
+        mean=np.array([mean]), std=np.array([std]), coast=0, rough=terrain.rough, terrain=terrain,
+    )  # fmt: skip
 
 
 def seen(iq, ranges, rho, **config):
@@ -163,17 +154,13 @@ def test_whole_pings_are_those_of_the_vectors(name):
 
 WIDTH, BASE, SLOPES = 1.0, np.linspace(-4.0, 4.0, 101), np.linspace(-1.05, 1.05, 15)
 THREE = Terrain(
-    names=('level', 'steady', 'scatter'),
-    rough=np.array([False, False, True]),
-    walk=np.array([0.1, 0.1, 0.15]),
-    phi=np.array([0.0, 0.9, 0.0]),
-    follow=np.array([False, True, False]),
-    scatter=np.array([0.0, 0.0, 0.5]),
+    names=('level', 'steady', 'scatter'), rough=np.array([False, False, True]),
+    walk=np.array([0.1, 0.1, 0.15]), phi=np.array([0.0, 0.9, 0.0]),
+    follow=np.array([False, True, False]), scatter=np.array([0.0, 0.0, 0.5]),
     coast=np.array([0, 1, 0]),
     transition=np.array([[0.86, 0.04, 0.1], [0.02, 0.93, 0.05], [0.2, 0.2, 0.6]]),
-    stationary=np.array([2.0, 4.0, 1.0]) / 7.0,
-    width=WIDTH,
-)
+    stationary=np.array([2.0, 4.0, 1.0]) / 7.0, width=WIDTH,
+)  # fmt: skip
 
 
 def hills(T=30, seed=3):
@@ -206,18 +193,9 @@ def exact(terrain, silent=()):
     )
     kinds = zip(terrain.walk, terrain.phi, terrain.follow, terrain.scatter)
     cells = smoothed(
-        (0.0, 1.0),
-        BASE,
-        SLOPES,
-        list(kinds),
-        terrain.transition,
-        terrain.stationary,
-        SLOPE0,
-        WIDTH,
-        logs,
-        echo,
-        terrain.coast.tolist(),
-    )
+        (0.0, 1.0), BASE, SLOPES, list(kinds), terrain.transition, terrain.stationary, SLOPE0,
+        WIDTH, logs, echo, terrain.coast.tolist(),
+    )  # fmt: skip
     return made, cells
 
 

@@ -238,13 +238,10 @@ def around_a_diver(off):
         vessel = 40.0 * np.array([np.cos(angle), np.sin(angle), 0.0])
         made.append(
             VesselPose(
-                stamp_ns=k * 10**9,
-                position=vessel,
-                orientation=(0.0, 0.0, 0.0, 1.0),
-                pose_covariance=np.diag([0.01] * 3 + [1e-8] * 3),
-                frame_id='map',
+                stamp_ns=k * 10**9, position=vessel, orientation=(0.0, 0.0, 0.0, 1.0),
+                pose_covariance=np.diag([0.01] * 3 + [1e-8] * 3), frame_id='map',
             )
-        )
+        )  # fmt: skip
         seen = turn @ (where - vessel) + 0.3 * rng.normal(size=3)
         made.append(
             RelativeFix(stamp_ns=k * 10**9, offset=seen, covariance=0.09 * np.eye(3), target_id=1)

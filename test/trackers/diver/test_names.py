@@ -142,12 +142,9 @@ def test_a_tag_without_a_number_is_as_before():
 
 def test_sensors_have_numbers_of_their_own():
     stated = {
-        'sensors': ['radar', 'lidar'],
-        'radar.fix_std': 4,
-        'lidar.fix_std': 0.5,
-        'radar.detection_probability': 0.5,
-        'radar.clutter_density': 1e-3,
-    }
+        'sensors': ['radar', 'lidar'], 'radar.fix_std': 4, 'lidar.fix_std': 0.5,
+        'radar.detection_probability': 0.5, 'radar.clutter_density': 1e-3,
+    }  # fmt: skip
     config = DiverConfig.from_mapping(stated)
     assert stated.items() <= config.as_dict().items()
     assert DiverConfig.from_mapping(config.as_dict()) == config

@@ -278,12 +278,8 @@ def test_the_same_depth_report_beside_every_arrival_is_one_measurement():
     flat = DiverConfig(max_tracks=1)
     models = build_models(flat)
     numbers = ping_measurements(
-        ping_of(place, **beside),
-        np.arange(4),
-        flat,
-        models,
-        Instruments().layout(flat, models),
-    ).measured
+        ping_of(place, **beside), np.arange(4), flat, models, Instruments().layout(flat, models),
+    ).measured  # fmt: skip
     assert numbers.kind.tolist() == [0, 0, 0, 0]
 
 
@@ -332,14 +328,9 @@ def ping(rx, toa, stamp_ns=SECOND, tx=(np.nan,) * 3, var_toa=1e-9, **more):
     n = len(rx)
     columns = {'rx_id': np.arange(n), 'bearing': np.full(n, np.nan)} | more
     return arrivals(
-        stamp_ns,
-        rx,
-        toa,
-        tx=tx,
-        var_toa=var_toa,
-        var_bearing=np.where(np.isnan(columns['bearing']), np.nan, 0.0001),
-        **columns,
-    )
+        stamp_ns, rx, toa, tx=tx, var_toa=var_toa,
+        var_bearing=np.where(np.isnan(columns['bearing']), np.nan, 0.0001), **columns,
+    )  # fmt: skip
 
 
 def receivers(n, rng):
@@ -389,12 +380,9 @@ def in_line(rng):
     toa += rng.choice([0.0, 1e-7, 1e-5]) * rng.normal(size=n)
     angles = np.arctan2(*(target[:2] - rx[:, :2]).T[::-1])
     return ping(
-        rx,
-        toa,
-        tx=(np.nan,) * 3 if tag else rx[0],
-        var_toa=10.0 ** rng.uniform(-18.0, -8.0),
+        rx, toa, tx=(np.nan,) * 3 if tag else rx[0], var_toa=10.0 ** rng.uniform(-18.0, -8.0),
         bearing=angles if rng.random() < 0.3 else np.full(n, np.nan),
-    )
+    )  # fmt: skip
 
 
 def test_a_target_on_the_line_of_a_line_array_breaks_nothing():
@@ -403,13 +391,9 @@ def test_a_target_on_the_line_of_a_line_array_breaks_nothing():
     for second in range(1, 151):
         item = in_line(rng)
         fix = localise(
-            item.rx,
-            item.toa,
-            item.var_toa,
-            tx=item.tx,
-            bearing=item.bearing,
+            item.rx, item.toa, item.var_toa, tx=item.tx, bearing=item.bearing,
             var_bearing=item.var_bearing,
-        )
+        )  # fmt: skip
         for found in (fix, *fix.alternatives) if hasattr(fix, 'covariance') else ():
             assert (np.linalg.eigvalsh(found.covariance) > 0.0).all()
         tracker.process(evolve(item, stamp_ns=second * SECOND))
@@ -439,12 +423,9 @@ def sharp_fixes(seed, count=12):
 
 def config(model_set, noise, seed=0):
     return DiverConfig(
-        model_set=model_set,
-        covariance_scale=(1e-4, 1e-2, 1.0)[seed % 3],
-        adaptation='fixed',
-        velocity_std=20.0,
-        acceleration_noise=noise,
-    )
+        model_set=model_set, covariance_scale=(1e-4, 1e-2, 1.0)[seed % 3], adaptation='fixed',
+        velocity_std=20.0, acceleration_noise=noise,
+    )  # fmt: skip
 
 
 def all_sound(known):
@@ -495,12 +476,9 @@ def sharp_pings(seed, passive, count=12):
         path += 0.0 if passive else np.linalg.norm(diver)
         variance = 10.0 ** rng.uniform(-22, -7, size=4)
         yield arrivals(
-            stamp,
-            RECEIVERS,
-            path / 1500.0 + np.sqrt(variance) * rng.normal(size=4),
-            tx=tx,
+            stamp, RECEIVERS, path / 1500.0 + np.sqrt(variance) * rng.normal(size=4), tx=tx,
             var_toa=variance,
-        )
+        )  # fmt: skip
         stamp += int(10 ** rng.uniform(0.0, 9.3))
 
 

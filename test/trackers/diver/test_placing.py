@@ -41,12 +41,9 @@ def geodetic(second, enu, cls=GeodeticFix, origin=ORIGIN, **values):
 
 def pose(second, position, yaw, frame_id='odom', **values):
     return VesselPose(
-        stamp_ns=round(second * SECOND),
-        position=position,
-        orientation=(0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)),
-        frame_id=frame_id,
-        **values,
-    )
+        stamp_ns=round(second * SECOND), position=position,
+        orientation=(0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)), frame_id=frame_id, **values,
+    )  # fmt: skip
 
 
 def relative(second, offset, **values):
@@ -359,12 +356,9 @@ def test_covariances_turn_with_the_axes():
     tracker = DiverTracker(config)
     for second in (1, 2):
         where = VesselFix(
-            stamp_ns=second * SECOND,
-            latitude=88.0,
-            longitude=91.0,
-            height=0.0,
+            stamp_ns=second * SECOND, latitude=88.0, longitude=91.0, height=0.0,
             covariance=np.diag([1e-4, 1e-4, 1e-4]),
-        )
+        )  # fmt: skip
         heading = VesselHeading(stamp_ns=second * SECOND, orientation=towards_north(0.0))
         run(tracker, [where, heading])
     spread = np.diag([25.0, 1.0, 1.0])

@@ -264,13 +264,10 @@ def ping(second):
 def test_a_scan_changes_nothing_of_the_state_before_it(association, dimensions):
     """States are values: those in the history are what a late measurement is replayed from."""
     config = DiverConfig(
-        association=association,
-        target_z=-2.0,
-        dimensions=dimensions,
-        coverage_sector=(0.0, 0.0, 0.0, 360.0, 0.0, 60.0),
-        bearing_bias_std_deg=1.0,
+        association=association, target_z=-2.0, dimensions=dimensions,
+        coverage_sector=(0.0, 0.0, 0.0, 360.0, 0.0, 60.0), bearing_bias_std_deg=1.0,
         fix_bias_std=0.2,
-    )
+    )  # fmt: skip
     tracker = DiverTracker(config)
     for second in range(1, 40):
         assert read_only(tracker._stream.state) > 20

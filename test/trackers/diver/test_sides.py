@@ -33,14 +33,9 @@ def ranges(second, position, rng, count, std=0.5):
     rx[:, :2] = rx[:, :2] @ TURNED.T
     path = 2.0 * np.linalg.norm(np.append(position, 0.0) - rx, axis=1)
     return arrivals(
-        round(second * SECOND),
-        rx,
-        (path + 2.0 * std * rng.normal(size=count)) / 1500.0,
-        tx_id=np.arange(count) + 1,
-        tx=rx,
-        var_toa=(2.0 * std / 1500.0) ** 2,
-        var_bearing=0.01,
-    )
+        round(second * SECOND), rx, (path + 2.0 * std * rng.normal(size=count)) / 1500.0,
+        tx_id=np.arange(count) + 1, tx=rx, var_toa=(2.0 * std / 1500.0) ** 2, var_bearing=0.01,
+    )  # fmt: skip
 
 
 def positions(steps, start=(-25.0, 30.0), velocity=(0.6, 0.2)):

@@ -27,28 +27,17 @@ SMALL = {**scenario('small').instruments(), 'particles': 2000}
 @pytest.fixture(scope='module')
 def pressure_scene():
     changes = {
-        'records': 1,
-        'record_seconds': 9.8,
-        'phones': 12,
-        'element_spacing': 0.18,
-        'frequency_max': 2000.0,
-        'steps_per_sigma': 0.0,
-        'block_seconds': 0.7,
-        'array_depth': 73.5,
+        'records': 1, 'record_seconds': 9.8, 'phones': 12, 'element_spacing': 0.18,
+        'frequency_max': 2000.0, 'steps_per_sigma': 0.0, 'block_seconds': 0.7, 'array_depth': 73.5,
         'first_depth': 130.0,
-    }
+    }  # fmt: skip
     return simulate(scenario('pressure', changes), 1)
 
 
 PRESSURE = {
-    'phones': 12,
-    'frequency_max': 2000.0,
-    'snapshot_seconds': 0.7,
-    'record_seconds': 9.8,
-    'depth_min': 122.0,
-    'depth_max': 172.0,
-    'particles': 500,
-}
+    'phones': 12, 'frequency_max': 2000.0, 'snapshot_seconds': 0.7, 'record_seconds': 9.8,
+    'depth_min': 122.0, 'depth_max': 172.0, 'particles': 500,
+}  # fmt: skip
 
 
 def blocks(scene, size=None):
@@ -86,12 +75,9 @@ def test_pressure_gives_what_its_cross_spectra_give(pressure_scene):
     frequency = np.arange(n // 2 + 1) / 0.7
     band = (frequency >= 50.0) & (frequency < 2000.001)
     spectra = CrossSpectra(
-        stamp_ns=estimate.stamp_ns,
-        frame_id='array',
-        frequency=frequency[band].astype(np.float32),
-        csdm=R[band].astype(np.complex64),
-        reference_depth=own[0].reference_depth,
-    )
+        stamp_ns=estimate.stamp_ns, frame_id='array', frequency=frequency[band].astype(np.float32),
+        csdm=R[band].astype(np.complex64), reference_depth=own[0].reference_depth,
+    )  # fmt: skip
     other, same = run([spectra], **PRESSURE)
     scale = tracker.response.sigma[0]
     assert np.abs(other.response.amplitude - tracker.response.amplitude).max() < 0.01 * scale

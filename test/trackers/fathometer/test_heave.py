@@ -60,12 +60,9 @@ def rms(x):
 
 def test_layers_are_followed_although_the_array_heaves(scene):
     _, found = run(
-        scene.traces(),
-        particles=3000,
-        heave='independent',
-        array_depth_std=0.5,
+        scene.traces(), particles=3000, heave='independent', array_depth_std=0.5,
         sound_speed_std=0.0,
-    )
+    )  # fmt: skip
     score = score_scene(found, scene, after=20)
     common, relative, heave, stated = errors(found, scene, after=20)
     assert score.right >= 0.95 and score.ospa <= 0.18

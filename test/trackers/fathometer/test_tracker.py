@@ -38,13 +38,10 @@ def traces(vectors, records, given=True):
     for k in records:
         sigma = np.full(len(vectors['depth']), vectors['sigma'][k])
         yield Trace(
-            stamp_ns=(k + 1) * RECORD_NS,
-            frame_id='array',
-            depth=vectors['depth'],
-            amplitude=vectors['amplitude'][k],
-            sigma=sigma if given else None,
+            stamp_ns=(k + 1) * RECORD_NS, frame_id='array', depth=vectors['depth'],
+            amplitude=vectors['amplitude'][k], sigma=sigma if given else None,
             reference_depth=float(vectors['reference_depth'][k]),
-        )
+        )  # fmt: skip
 
 
 def drift(seed=0, **changes):

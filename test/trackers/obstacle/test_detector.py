@@ -170,14 +170,9 @@ def beams(angles, start_ns=10**9, step_ns=10**8, target=(0.1, 20.0), rows=100, *
         off = np.hypot((angle - target[0]) / (2.0 * STEP), (r - target[1]) / 0.5)
         amplitude += 150.0 * np.exp(-np.square(off))
         yield SonarImage(
-            stamp_ns=start_ns + k * step_ns,
-            range=r,
-            bearing=[angle],
-            amplitude=amplitude[:, None],
-            frame_id='sonar',
-            scanning=True,
-            **changes,
-        )
+            stamp_ns=start_ns + k * step_ns, range=r, bearing=[angle],
+            amplitude=amplitude[:, None], frame_id='sonar', scanning=True, **changes,
+        )  # fmt: skip
 
 
 def sweeps(images, **parameters):

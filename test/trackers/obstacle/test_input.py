@@ -99,12 +99,9 @@ def test_range_and_bearing_are_correlated_as_the_place_is(side):
         tracker.process(still(second, x=1.5 * second))
         east, north = 80.0 - 1.5 * second, 40.0 * side
         ping = Detections(
-            stamp_ns=second * SECOND,
-            range=[np.hypot(east, north)],
-            bearing=[np.arctan2(north, east)],
-            var_range=[25.0],
-            var_bearing=[1e-4],
-        )
+            stamp_ns=second * SECOND, range=[np.hypot(east, north)],
+            bearing=[np.arctan2(north, east)], var_range=[25.0], var_bearing=[1e-4],
+        )  # fmt: skip
         (estimate,) = tracker.process(ping)
     place = {name: value[0] for name, value in estimate.extras.items() if name.startswith('p')}
     P = [[place[f'place_cov_{min(a, b)}_{max(a, b)}'] for b in 'xyz'] for a in 'xyz']
@@ -206,12 +203,9 @@ def test_nonsense_gives_finite_numbers(model, timing):
     rng = np.random.default_rng(1)
     tracker = ObstacleTracker(
         ObstacleConfig(
-            azimuth_model=model,
-            ping_timing=timing,
-            confirm_hits=1,
-            max_navigation_gap=5.0,
+            azimuth_model=model, ping_timing=timing, confirm_hits=1, max_navigation_gap=5.0,
         )
-    )
+    )  # fmt: skip
     estimates = []
     for k in range(1, 60):
         q = rng.normal(size=4)
@@ -249,12 +243,9 @@ def pings(variance, count=25):
         )
         yield Altitude(stamp_ns=stamp, altitude=12.0)
         yield Detections(
-            stamp_ns=stamp,
-            range=[np.hypot(60.0 - x, 2.0)],
-            bearing=[0.0],
-            var_range=[variance],
+            stamp_ns=stamp, range=[np.hypot(60.0 - x, 2.0)], bearing=[0.0], var_range=[variance],
             var_bearing=[1e-11 * max(variance, 0.2)],
-        )
+        )  # fmt: skip
 
 
 @pytest.mark.parametrize('variance', [0.03, 2e-12])

@@ -30,12 +30,9 @@ from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, Tr
 
 P_D = 0.9
 STILL = {
-    'scale_std': 0.0,
-    'navigation_noise': (0.0, 0.0, 0.0),
-    'drift_std': 0.0,
-    'yaw_error_std_deg': 0.0,
-    'navigation_delay_std': 0.0,
-}
+    'scale_std': 0.0, 'navigation_noise': (0.0, 0.0, 0.0), 'drift_std': 0.0,
+    'yaw_error_std_deg': 0.0, 'navigation_delay_std': 0.0,
+}  # fmt: skip
 DEPTH = 20.0
 HALF = np.radians(7.5)
 R = np.diag([0.15**2, np.radians(0.25) ** 2])

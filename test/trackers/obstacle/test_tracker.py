@@ -75,12 +75,9 @@ def test_an_empty_ping_is_a_ping():
 def test_conventions_of_sonars(model, timing):
     """The offset is found when tracker and sonar agree on azimuth and timing."""
     overrides = {
-        'azimuth_model': model,
-        'ping_timing': timing,
-        'roll_rms_deg': 4.0,
-        'vertical_offset': -4.0,
-        'sonar_mount_rpy_deg': (2.0, 3.0, -4.0),
-    }
+        'azimuth_model': model, 'ping_timing': timing, 'roll_rms_deg': 4.0,
+        'vertical_offset': -4.0, 'sonar_mount_rpy_deg': (2.0, 3.0, -4.0),
+    }  # fmt: skip
     scene, final = track_scene('approach', 5, overrides)
     error, variance, _, _ = offset_at(scene, final, 40.0)
     assert abs(error) < 3.0 * np.sqrt(variance)
