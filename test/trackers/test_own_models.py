@@ -215,16 +215,6 @@ def test_a_behaviour_written_again_gives_the_same_estimates(installed):
     assert moving > 0.9
 
 
-def test_beside_the_built_in_ones(installed):
-    names = 'fixed', 'moving', 'tiny_mover'
-    _, final = track_scene('movers', 1, behaviours=names)
-    extras = list(final.values())[-1].extras
-    total = sum(extras[f'prob_{name}'] for name in names)
-    assert total == pytest.approx(1.0) and extras['prob_tiny_mover'] == pytest.approx(
-        extras['prob_moving']
-    )
-
-
 @pytest.mark.parametrize(
     'model_set, problem',
     [

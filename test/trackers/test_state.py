@@ -93,19 +93,6 @@ def test_what_several_hold_stays_shared_and_queues_keep_their_length(tmp_path):
     assert again.counts is again._queue.counts
 
 
-def test_damaged_files_are_one_sentence(file):
-    good, rng = file.read_bytes(), np.random.default_rng(1)
-    for k in range(200):
-        content = bytearray(good)
-        if k % 2:
-            content[rng.integers(len(good))] ^= 1 << rng.integers(8)
-        else:
-            del content[rng.integers(len(good)) :]
-        file.write_bytes(content)
-        with pytest.raises(StateError):
-            read_state(file)
-
-
 def test_a_sound_state_under_another_checksum_is_damaged(file):
     """The npz has checksums of its own, which know nothing of each other and not of the line."""
     run = tracked('diver_table1')

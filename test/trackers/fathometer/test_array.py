@@ -40,22 +40,8 @@ PRESSURE = {
 }  # fmt: skip
 
 
-def blocks(scene, size=None):
-    """The scene's pressure, as it is or in blocks of `size` samples."""
-    own = [each.measurement for each in scene.measurements]
-    if size is None:
-        return own
-    p = np.concatenate([each.pressure for each in own])
-    return [
-        Pressure(
-            stamp_ns=own[0].stamp_ns + round(first / own[0].sample_rate * 1e9),
-            frame_id=own[0].frame_id,
-            pressure=p[first : first + size],
-            sample_rate=own[0].sample_rate,
-            reference_depth=own[0].reference_depth,
-        )
-        for first in range(0, len(p) - 1, size)
-    ]
+def blocks(scene):
+    return [each.measurement for each in scene.measurements]
 
 
 def test_pressure_gives_what_its_cross_spectra_give(pressure_scene):
@@ -106,13 +92,6 @@ def test_the_noise_is_measured_right_though_it_fades_with_depth():
         tracker, _ = run(noise, particles=50, **options)
         seen.append(tracker.response.amplitude / tracker.response.sigma)
     assert np.sqrt(np.mean(np.square(seen))) == pytest.approx(1.0, abs=0.06)
-
-
-@pytest.mark.parametrize('size', [977, 50_000])
-def test_blocks_of_any_length_give_the_same(pressure_scene, size):
-    own, _ = run(blocks(pressure_scene), **PRESSURE)
-    other, _ = run(blocks(pressure_scene, size), **PRESSURE)
-    assert np.allclose(own.response.amplitude, other.response.amplitude, atol=1e-7)
 
 
 def test_a_lost_block_is_counted_and_a_long_gap_begins_anew(pressure_scene):
