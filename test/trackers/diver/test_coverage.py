@@ -237,14 +237,10 @@ def test_sectors_that_are_none_are_refused(values, problem):
     ],
 )
 def test_files_that_hold_no_table_are_refused(tmp_path, header, rows, problem):
-    config = DiverConfig(coverage_file=written(tmp_path, 'table.csv', header, rows))
-    with pytest.raises(ConfigError, match=problem):
-        DiverTracker(config)
-
-
-def test_a_file_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match='nowhere.csv'):
-        DiverTracker(DiverConfig(coverage_file=str(tmp_path / 'nowhere.csv')))
+    file = written(tmp_path, 'table.csv', header, rows)
+    for name, said in ((file, problem), (file + '.no', 'table.csv.no')):
+        with pytest.raises(ConfigError, match=said):
+            DiverTracker(DiverConfig(coverage_file=name))
 
 
 def test_a_running_tracker_takes_another_sector():

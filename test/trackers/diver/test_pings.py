@@ -337,29 +337,15 @@ def receivers(n, rng):
     return np.column_stack([rng.uniform(-500.0, 500.0, (n, 2)), np.zeros(n)])
 
 
-def good_tag(rng, stamp_ns):
-    rx = receivers(MAX_PAIRS, rng)
-    return ping(rx, np.linalg.norm(rx - [20.0, 30.0, 0.0], axis=1) / 1500.0, stamp_ns)
-
-
-def test_a_tag_that_very_many_receivers_hear_is_one_diver():
-    rng = np.random.default_rng(2)
+@pytest.mark.parametrize('tag, count', [(True, MAX_PAIRS), (False, 300)])
+def test_what_very_many_receivers_hear_is_one_diver(tag, count):
+    rng, place = np.random.default_rng(2), np.array([20.0, 30.0, 0.0])
     tracker = DiverTracker(DiverConfig())
     for second in range(1, 5):
-        (estimate,) = tracker.process(good_tag(rng, second * SECOND))
-    assert len(estimate) == 1
-    np.testing.assert_allclose(estimate.state[0, :2], (20.0, 30.0), atol=0.05)
-
-
-def test_an_echo_that_very_many_receivers_hear_is_taken_whole():
-    rng = np.random.default_rng(3)
-    tracker = DiverTracker(DiverConfig())
-    rx = receivers(300, rng)
-    place = np.array([20.0, 30.0, 0.0])
-    path = np.linalg.norm(rx - place, axis=1) + np.linalg.norm(place)
-    for second in range(1, 5):
-        item = ping(rx, path / 1500.0, second * SECOND, tx=(0.0, 0.0, 0.0))
-        (estimate,) = tracker.process(item)
+        rx = receivers(count, rng)
+        path = np.linalg.norm(rx - place, axis=1) + (0.0 if tag else np.linalg.norm(place))
+        tx = (np.nan,) * 3 if tag else (0.0, 0.0, 0.0)
+        (estimate,) = tracker.process(ping(rx, path / 1500.0, second * SECOND, tx=tx))
     assert len(estimate) == 1
     np.testing.assert_allclose(estimate.state[0, :2], place[:2], atol=0.05)
 

@@ -9,6 +9,7 @@
 """Latitude and longitude, and positions relative to a vessel, as the tracker places them."""
 
 from attrs import evolve
+from helpers.diver_runs import run, SECOND
 import numpy as np
 import pymap3d
 import pytest
@@ -25,7 +26,6 @@ from sonar_imm.measurements import (
 )
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
-SECOND = 10**9
 ORIGIN = Origin(59.0, 10.0)
 
 
@@ -48,12 +48,6 @@ def pose(second, position, yaw, frame_id='odom', **values):
 
 def relative(second, offset, **values):
     return RelativeFix(stamp_ns=round(second * SECOND), offset=offset, **values)
-
-
-def run(tracker, measurements):
-    made = [item for measurement in measurements for item in tracker.process(measurement)]
-    final = {item.stamp_ns: item for item in made}
-    return [final[stamp] for stamp in sorted(final)]
 
 
 # -- latitude and longitude ----------------------------------------------------------------------
