@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Raw arrivals in the field: two receivers, and single ranges.
+"""Raw arrivals in the field: two receivers, single ranges, few receivers a ping.
 
     python -m benchmarks.diver_arrivals --out docs/results/diver_arrivals.json
 
@@ -17,6 +17,10 @@ transponder that stands; `ship on a line`; `one receiver`. NEES of 2 is due; `in
 in the 95 % ellipse; `sure and wrong` the share of runs of which a fifth of the estimates have a
 NEES above 50; `begins s` is the median of the first confirmed estimate; `tracked` of the runs have
 one. Side A and side B are in the estimate, so its RMSE is half their distance.
+
+`few`: of eight receivers about, so many hear a ping (2 % wild, .3 m of path); `echo` has a
+transmitter, `tag` none, in steps of 1 s and of 29 s, in which a diver turns several times. `ratio`
+is the RMSE of the default over that of `heading_speed` alone.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.diver_families import INSIDE
 from benchmarks.study import final_estimates, Parts, study, truths
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Arrivals
@@ -36,6 +41,10 @@ from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 STD, SOUND = 0.5, 1500.0
 SETTLED, WRONG = 10, 50.0
 BUOYS = np.array([[-40.0, -40.0], [40.0, -40.0], [40.0, 40.0], [-40.0, 40.0]])
+POOL = np.array(
+    [[0, 0], [70, 10], [-60, 45], [10, 85], [-40, -60], [80, -50], [120, 70], [-90, -10]], float
+)
+"""Receivers of `few`."""
 
 Places = Callable[[int, np.random.Generator], FloatArray]
 """Where receivers (k, 2) ask at a ping."""
@@ -77,11 +86,12 @@ def transponder(stamp_ns: int, at: FloatArray, target: FloatArray, rng: Any) -> 
     )
 
 
-def followed(pings: list[Arrivals], track: TrueTrack) -> Score:
+def followed(pings: list[Arrivals], track: TrueTrack, **values: Any) -> Score:
     """Track a diver; estimates without a confirmed track are left out."""
     at = {int(stamp): k for k, stamp in enumerate(track.stamp_ns)}
     rows: list[tuple[float, float, float]] = []
-    for stamp, estimate in sorted(final_estimates(DiverTracker(DiverConfig()), pings).items()):
+    tracker = DiverTracker(DiverConfig(**values))
+    for stamp, estimate in sorted(final_estimates(tracker, pings).items()):
         for row in np.flatnonzero(estimate.extras['track_state'] > 0)[:1]:
             error = estimate.state[row, :2] - track.position[at[stamp], :2]
             nees = error @ np.linalg.solve(estimate.covariance[row, :2, :2], error)
@@ -154,17 +164,84 @@ def row_of(scores: list[Score], first: int, last: int) -> dict[str, float | None
         'RMSE': float(np.sqrt(square.mean())),
         'median': float(np.sqrt(np.median(square))),
         'NEES': float(nees.mean()),
-        'inside': float((nees < 5.991).mean()),
+        'inside': float((nees < INSIDE).mean()),
         'sure and wrong': float(np.mean([(part.nees > WRONG).mean() > 0.2 for part in shown])),
         'begins s': float(np.median([score.ping[0] for score in scores if len(score.ping)])),
     }
 
 
-def main(runs: int = 20, first: int = 100, only: tuple[str, ...] = tuple(SCENES)) -> Parts:
+# -- few receivers a ping ------------------------------------------------------------------------
+
+KINDS: dict[str, tuple[bool, dict[str, Any]]] = {
+    'echo, 1 s': (False, {'duration': 99.0}),
+    'tag, 1 s': (True, {'duration': 99.0}),
+    'tag, 29 s': (True, {'duration': 2000.0, 'step': 29.0, 'turn_deg': 180.0}),
+}
+
+
+def thinned(seed: int, receivers: int, passive: bool, track: TrueTrack) -> list[Arrivals]:
+    """Pings that some of the receivers hear."""
+    rng, std = np.random.default_rng([51, seed, receivers]), 0.3
+    pings = []
+    for stamp, target in zip(track.stamp_ns, track.position[:, :2]):
+        own = np.sort(rng.permutation(len(POOL))[:receivers])
+        length = np.hypot(*(POOL[own] - target).T) + std * rng.normal(size=receivers)
+        length += (0.0 if passive else np.hypot(*target)) * np.ones(receivers)
+        length += (rng.random(receivers) < 0.02) * rng.uniform(5.0, 50.0, receivers)
+        nothing = np.full(receivers, np.nan)
+        pings.append(
+            Arrivals(
+                stamp_ns=int(stamp),
+                tx_id=np.zeros(receivers),
+                rx_id=own,
+                tx=np.full((receivers, 3), np.nan if passive else 0.0),
+                rx=np.column_stack([POOL[own], np.zeros(receivers)]),
+                toa=length / SOUND + (5.0 if passive else 0.0),
+                var_toa=np.full(receivers, (std / SOUND) ** 2),
+                bearing=nothing,
+                var_bearing=nothing,
+                frame_id='map',
+            )
+        )
+    return pings
+
+
+def few(kind: str, receivers: int, seeds: range) -> dict[str, float]:
+    """The default and `heading_speed` alone."""
+    passive, values = KINDS[kind]
+    late: dict[str, list[Score]] = {'families': [], 'heading_speed': []}
+    for seed in seeds:
+        track = path(seed, **values)
+        pings = thinned(seed, receivers, passive, track)
+        for model_set, scores in late.items():
+            score = followed(pings, track, max_tracks=1, model_set=model_set)
+            settled = score.ping >= SETTLED
+            scores.append(Score(*(column[settled] for column in score)))
+    square, nees = (
+        {name: np.concatenate([score[k] for score in scores]) for name, scores in late.items()}
+        for k in (1, 2)
+    )
+    rmse = {name: float(np.sqrt(each.mean())) for name, each in square.items()}
+    return {
+        'RMSE': rmse['families'],
+        'heading_speed': rmse['heading_speed'],
+        'ratio': rmse['families'] / rmse['heading_speed'],
+        'NEES': float(nees['families'].mean()),
+        'heading_speed NEES': float(nees['heading_speed'].mean()),
+        'inside': float((nees['families'] < INSIDE).mean()),
+    }
+
+
+def main(runs: int = 20, first: int = 100, only: tuple[str, ...] = (*SCENES, *KINDS)) -> Parts:
     yield {'runs': runs, 'first': first}
+    seeds = range(first, first + runs)
     for name in only:
-        yield {'table': scene(name, range(first, first + runs))}
+        if name in SCENES:
+            yield {'table': scene(name, seeds)}
+            continue
+        for receivers in (5, 4, 3):
+            yield {'few': {f'{name}, {receivers} receivers': few(name, receivers, seeds)}}
 
 
 if __name__ == '__main__':
-    study(main, only={'choices': list(SCENES)})
+    study(main, only={'choices': [*SCENES, *KINDS]})

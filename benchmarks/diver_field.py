@@ -15,6 +15,7 @@ it.
 *One target* (`max_tracks: 1`), 200 fixes, one a second. RMSE, NEES (2 is due) and the share in the
 95 % ellipse are of all fixes after the tenth; `rows`: mean number alive. `warned`: share of the
 runs in which the warning of the scene stands at the end; `other`: mean number of other warnings.
+`clean` has clean scenes alone, with ten times the runs.
 
 - `clean`, and faults of fixes, of which the tracker is told the kind of target only of a `rov`.
   `bursts`: ten fixes 25 m off, twice; `two 100 m`: two fixes, thrice; `multipath`: 15 to 40 m in
@@ -492,6 +493,16 @@ def averaged(run: Callable[..., Mapping[str, float]], *arguments: Any) -> Callab
     return lambda seeds: mean_of([run(seed, *arguments) for seed in seeds])
 
 
+MANY = 10
+
+
+def many_clean(target: str, seeds: range) -> Mapping[str, Any]:
+    """The row of a clean scene of `MANY` times the seeds."""
+    return one_target(
+        SINGLE[f'{target}, clean'], range(seeds.start, seeds.start + MANY * len(seeds))
+    )
+
+
 SCENES: dict[str, dict[str, Callable[[range], Mapping[str, Any]]]] = {
     'clumps': {
         'radar clumps': averaged(clumps, RADAR),
@@ -505,6 +516,10 @@ SCENES: dict[str, dict[str, Callable[[range], Mapping[str, Any]]]] = {
         for case in CASES
     },
     'single': {name: partial(one_target, scene) for name, scene in SINGLE.items()},
+    'clean': {
+        f'{target}, {MANY} times the runs': partial(many_clean, target)
+        for target in ('diver', 'rov', 'slow boat')
+    },
     'polled': {f'{targets} divers': averaged(polled, targets) for targets in (2, 3)},
     'existence': {
         f'{dt:g} s, {mean:g} false': partial(reliability, dt, mean)

@@ -470,7 +470,7 @@ def update_by_ping(
     if not (scale == 1.0).all():
         measured = measured._replace(variance=scale[:, None] * measured.variance)
     if ping.passive or ping.pairs > MOST_SUBSETS:
-        heavy = measured, find_optima(ping, config), DEGREES
+        heavy = measured, find_optima(ping, config), DEGREES, config.outlier_probability
         x, P, evidence, weights = student_t_ping(x, P, mask, config.target_z, *heavy)
         # Jacobian of the scaled residuals.
         evidence = evidence - 0.5 * len(ping.row) * np.log(scale)
@@ -516,9 +516,8 @@ def begin_from_ping(
     if ping.passive:
         uniform = np.full(len(x), 1.0 / len(x))
         x, P, mask = _with_emission(x, P, uniform, ping, mask, config.target_z)
-    at, covariance, evidence, _ = student_t_ping(
-        x, P, mask, config.target_z, ping.measured, position[None], DEGREES
-    )
+    heavy = ping.measured, position[None], DEGREES, config.outlier_probability
+    at, covariance, evidence, _ = student_t_ping(x, P, mask, config.target_z, *heavy)
     return at[:, :n], _repair(covariance[:, :n, :n])[0], evidence
 
 

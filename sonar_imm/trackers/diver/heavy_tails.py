@@ -12,10 +12,17 @@ The mathematics of `oracles.student_t` of the tests, for a list of L hypotheses 
 `explanations`. Every hypothesis starts from its own prediction and from the positions that the
 ping suggests by itself, so that many good arrivals outvote any prior and no prior gates a ping
 away. The searches of all hypotheses are one list; those that have arrived drop out of it.
+
+Few arrivals, one of them wild, fit several places. Each place that a hypothesis reaches counts by
+its evidence, and the updated Gaussian has the moments of all of them. The search climbs the
+density of Student's t alone, which has a slope everywhere. The evidence of a place also knows wild
+arrivals: ``(1 - e) t(r) + e u`` for each. With t alone, one late arrival costs more than a place
+that the diver cannot have reached.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +53,22 @@ SMALLEST_GAIN = 1e-7
 SHORTER = 0.5 ** np.arange(1, 10)
 """Shares of a step that are tried where the whole of it does not climb."""
 
+SAME = 4.0
+"""Squared distance, in standard deviations of the updated state, within which two maxima are one
+place."""
+
+PRUNE = 14.0
+"""A place whose log-density is this much below the best one of its hypothesis is dropped."""
+
+FEW_ARRIVALS = 6
+"""Measurements up to which each one may be the wild one that hides a place."""
+
+NO_WEIGHT = 1e12
+"""Factor on the variance of a measurement that is left out."""
+
+LEAST_GOOD = 1e-9
+"""Least probability that an arrival is good; keeps its variance finite."""
+
 FEW = 8
 """Unknowns up to which the equations of all searches are solved together."""
 
@@ -68,6 +91,8 @@ class _Prior(NamedTuple):
     """(C, L) the same, not below what a covariance can hold beside the prior."""
     height: float
     degrees: float
+    wild: FloatArray
+    """(C, L) density of a wild arrival relative to the largest of a good one."""
 
 
 class _Searches(NamedTuple):
@@ -93,7 +118,12 @@ class _Searches(NamedTuple):
 
 
 def _prior(
-    x: FloatArray, P: FloatArray, height: float, measured: PingMeasurements, degrees: float
+    x: FloatArray,
+    P: FloatArray,
+    height: float,
+    measured: PingMeasurements,
+    degrees: float,
+    outlier_probability: float = 0.0,
 ) -> tuple[_Prior, IndexArray]:
     """Return the prior of the hypotheses whose covariances have roots, and which these are."""
     n, columns = x.shape[1], measured.columns
@@ -109,7 +139,11 @@ def _prior(
     variance = np.broadcast_to(variances_of(measured), (len(columns), len(x)))
     variance = pick(variance, known)
     parts = own, active, x[np.ix_(known, active)].T.copy(), pick(root, known), variance
-    prior = _Prior(*parts, variance, height, degrees)
+    peak = math.exp(math.lgamma(0.5 * degrees + 0.5) - math.lgamma(0.5 * degrees))
+    peak /= math.sqrt(degrees * math.pi)
+    odds = outlier_probability / (1.0 - outlier_probability)
+    wild = odds * measured.density[:, None] * np.sqrt(variance) / peak
+    prior = _Prior(*parts, variance, height, degrees, wild)
     nothing = np.zeros(prior.mean.shape)
     seen = (_look(prior, np.arange(len(known)), nothing, nothing[0]).slope ** 2).sum(axis=1)
     return prior._replace(noise=np.maximum(variance, JITTER * seen)), known
@@ -264,20 +298,23 @@ def student_t_ping(
     measured: PingMeasurements,
     positions: FloatArray,
     degrees: float,
+    outlier_probability: float,
 ) -> Updated:
     """Update the hypotheses about a diver by all that a ping measured at once, with heavy tails.
 
     :param estimated: (n,) False for what is only considered.
     :param positions: (S, 2) where to start besides the predictions.
+    :param outlier_probability: of each measurement to be wild, see `PingMeasurements.density`.
     :returns: x, P, the log-evidence (L,) up to a constant common to the hypotheses, and the
         weights (L, C). A hypothesis whose covariance has no root stays as it is, with evidence
         -inf.
     """
 
     def update(x: FloatArray, P: FloatArray, measured: PingMeasurements) -> Updated:
-        return _student_t_ping(x, P, estimated, height, measured, positions, degrees)
+        law = degrees, outlier_probability
+        return _student_t_ping(x, P, estimated, height, measured, positions, *law)
 
-    return in_parts(update, x, P, measured, 1 + len(positions))
+    return in_parts(update, x, P, measured, 1 + len(positions) + FEW_ARRIVALS)
 
 
 def _student_t_ping(
@@ -288,41 +325,104 @@ def _student_t_ping(
     measured: PingMeasurements,
     positions: FloatArray,
     degrees: float,
+    outlier_probability: float,
 ) -> Updated:
     L, C = len(x), len(measured.value)
     x1, P1, evidence, weights = x.copy(), P.copy(), np.full(L, -np.inf), np.zeros((L, C))
-    prior, known = _prior(x, P, height, measured, degrees)
+    prior, known = _prior(x, P, height, measured, degrees, outlier_probability)
     if not len(known):
         return x1, P1, evidence, weights
     own = np.arange(len(known))
     starts = [_start(prior, own, None)]
     for place in positions:
         starts.append(_start(prior, own, np.broadcast_to(place[:, None], (2, len(own)))))
-    u, value = _climb(prior, _Searches(*(np.concatenate(p, axis=-1) for p in zip(*starts))))
-    u, value = u.reshape(len(u), len(starts), -1), value.reshape(len(starts), -1)
-    at, best = u[:, 0], value[0]
-    for k in range(1, len(starts)):
-        better = value[k] > best + SMALLEST_GAIN
-        at, best = np.where(better, u[:, k], at), np.where(better, value[k], best)
-    now = _look(prior, own, at, np.zeros(len(own)))
-    information = _information(now.slope, now.slope * (now.weight / prior.noise)[:, None])
-    evidence[known] = best - 0.5 * np.linalg.slogdet(np.moveaxis(information, -1, 0))[1]
-    weights[known] = now.weight.T
-    place = prior.mean + np.einsum('abs,bs->as', prior.root[: len(at), : len(at)], at)
-    mean = x[known].T.copy()
+    u, _ = _climb(prior, _Searches(*(np.concatenate(p, axis=-1) for p in zip(*starts))))
+    if C <= FEW_ARRIVALS and outlier_probability > 0.0:
+        u = np.concatenate([u, _without_one(prior)], axis=1)
+    now = _distinct(prior, u)
+    of, every = now.of, known[now.of]
+    noise = pick(prior.noise, of)
+    information = _information(now.slope, now.slope * (now.weight / noise)[:, None])
+    log = now.value - 0.5 * np.linalg.slogdet(np.moveaxis(information, -1, 0))[1]
+    place = pick(prior.mean, of)
+    place += np.einsum('abs,bs->as', pick(prior.root[: len(u), : len(u)], of), now.u)
+    mean = x[every].T.copy()
     there = mean.copy()
     there[prior.active] = place
     residual, gradient = residuals_at(there, measured, height)
     # The mean, then the covariance, which is that of wider weights.
-    wider = np.repeat([1.0, (degrees + 3.0) / (degrees + 1.0)], len(own))
+    wider = np.repeat([1.0, (degrees + 3.0) / (degrees + 1.0)], len(of))
     there, residual, gradient, weight, variance = (
         np.concatenate([part, part], axis=-1)
-        for part in (there, residual, gradient, now.weight, prior.variance)
+        for part in (there, residual, gradient, now.weight, pick(prior.variance, of))
     )
-    means, covariances = np.tile(mean, 2), np.tile(symmetric(last_axis(P[known])), 2)
+    means, covariances = np.tile(mean, 2), np.tile(symmetric(last_axis(P[every])), 2)
     for c in range(C):
         innovation = residual[c] + (gradient[c] * (there - means)).sum(axis=0)
         noise = wider * variance[c] / weight[c]
         consider_scalar(means, covariances, gradient[c], noise, innovation, estimated)
-    x1[known], P1[known] = means[:, : len(own)].T, np.moveaxis(covariances[..., len(own) :], -1, 0)
+    first = np.searchsorted(of, own)
+    best = np.maximum.reduceat(log, first)
+    share = np.exp(log - best[of])
+    total = np.add.reduceat(share, first)
+    share /= total[of]
+    each = means[:, : len(of)]
+    mean = np.add.reduceat(share * each, first, axis=1)
+    apart = each - pick(mean, of)
+    spread = covariances[..., len(of) :] + apart[:, None] * apart
+    evidence[known] = best + np.log(total)
+    weights[known] = np.add.reduceat(share * now.weight, first, axis=1).T
+    x1[known] = mean.T
+    P1[known] = np.moveaxis(np.add.reduceat(share * spread, first, axis=2), -1, 0)
     return x1, P1, evidence, weights
+
+
+def _without_one(prior: _Prior) -> FloatArray:
+    """Return the maxima (a, C L) of all measurements but one each, uphill of the predictions."""
+    C, L = prior.variance.shape
+    of = np.tile(np.arange(L), C)
+    variance = pick(prior.variance, of)
+    variance[np.repeat(np.arange(C), L), np.arange(C * L)] *= NO_WEIGHT
+    own = prior._replace(
+        mean=pick(prior.mean, of),
+        root=pick(prior.root, of),
+        variance=variance,
+        noise=np.maximum(pick(prior.noise, of), variance),
+    )
+    return _climb(own, _start(own, np.arange(C * L), None))[0]
+
+
+def _distinct(prior: _Prior, u: FloatArray) -> _Searches:
+    """Return the distinct places among u (a, S L) by hypothesis.
+
+    Their weights and log-densities know wild measurements.
+    """
+    L = prior.mean.shape[1]
+    of = np.arange(L)
+    every = _look(prior, np.tile(of, u.shape[1] // L), u, np.zeros(u.shape[1]))
+    misfit = every.residual**2 / pick(prior.variance, every.of)
+    tail = -0.5 * (prior.degrees + 1.0) * np.log1p(misfit / prior.degrees)
+    fit = np.logaddexp(tail, np.log(np.maximum(pick(prior.wild, every.of), 1e-300)))
+    good = np.maximum(np.exp(tail - fit), LEAST_GOOD)
+    every = every._replace(
+        value=every.value + (fit - tail).sum(axis=0), weight=every.weight * good
+    )
+    order = np.argsort(-every.value.reshape(-1, L), axis=0, kind='stable')
+    found: list[_Searches] = []
+    kept: list[BoolArray] = []
+    for row in order:
+        now = every.only(row * L + of)
+        new = np.ones(L, np.bool_)
+        if found:
+            new = now.value >= found[0].value - PRUNE
+        for other, was in zip(found, kept):
+            apart = now.u - other.u
+            along = np.einsum('cas,as->cs', other.slope, apart)
+            distance = (apart**2).sum(axis=0)
+            distance += (along**2 * other.weight / prior.noise).sum(axis=0)
+            new &= ~was | (distance > SAME)
+        found.append(now)
+        kept.append(new)
+    chosen = np.flatnonzero(np.array(kept).T.ravel())
+    together = (np.stack(part, axis=-1) for part in zip(*found))
+    return _Searches(*(part.reshape(*part.shape[:-2], -1) for part in together)).only(chosen)

@@ -64,7 +64,7 @@ def hypotheses(seed, receivers, tag=False, instruments=False):
 
 def updates(measured, x, P, estimated, positions):
     subsets = subset_ping(x, P, estimated, -5.0, measured, 0.05, 128)
-    return *subsets, *student_t_ping(x, P, estimated, -5.0, measured, positions, 4.0)
+    return *subsets, *student_t_ping(x, P, estimated, -5.0, measured, positions, 4.0, 0.02)
 
 
 @pytest.mark.parametrize('tag', [False, True])
@@ -117,7 +117,7 @@ def test_a_hypothesis_whose_covariance_has_no_root_stays_as_it_is():
     P[4, 1, 1] = -1.0
     P[6] = np.nan
     estimated, positions = np.ones(MOTION, bool), truth[None, :2]
-    heavy = estimated, -5.0, measured, positions, 4.0
+    heavy = estimated, -5.0, measured, positions, 4.0, 0.02
     after = student_t_ping(x, P, *heavy)
     lost = np.isin(np.arange(L), [4, 6])
     np.testing.assert_array_equal(np.isfinite(after[2]), ~lost)
@@ -133,8 +133,52 @@ def test_a_hypothesis_whose_covariance_has_no_root_stays_as_it_is():
 def test_many_arrivals_lead_all_hypotheses_to_one_place():
     """From wherever they start: the ping by itself says where the diver is."""
     x, P, measured, truth = hypotheses(6, 12)
-    heavy = np.ones(MOTION, bool), -5.0, measured, truth[None, :2] + 5.0, 4.0
+    heavy = np.ones(MOTION, bool), -5.0, measured, truth[None, :2] + 5.0, 4.0, 0.02
     mean, covariance, _, weights = student_t_ping(x, P, *heavy)
     assert np.hypot(*(mean[:, :2] - truth[:2]).T).max() < 1.0
     assert (weights[:, 2] < 0.1).all()  # the echo that is late
     np.testing.assert_array_equal(covariance, np.swapaxes(covariance, 1, 2))
+
+
+RECEIVERS = np.array([[10, 85, 0], [-40, -60, 0], [80, -50, 0], [-90, -10, 0]], float)
+"""Four receivers, one of which may hear the tag late: three of them leave two places."""
+
+TAG_CASES = [(28.0, 0.02), (28.0, 1e-6), (14.0, 0.02), (-28.0, 0.02), (60.0, 0.05), (0.0, 0.02)]
+
+
+@pytest.mark.parametrize('late, wild', TAG_CASES)
+def test_a_tag_that_four_receivers_hear_is_where_the_integral_says(late, wild):
+    """Mean, spread and evidence of the posterior of the position, summed over a fine grid."""
+    std, spread, density = 2.0, 20.0, 1.0 / 50.0
+    truth, mean = np.array([-33.0, -17.0, 0.0]), np.array([-21.0, -26.0])
+    columns = np.full((4, 7), -1)
+    columns[:, :2], columns[:, EMISSION] = (0, 1), 2
+    kind, geometry = np.full(4, ONE_WAY), (np.zeros((4, 3)), RECEIVERS)
+    value = observe(truth[:, None], 0.0, kind, columns, *geometry)[0][:, 0]
+    value += [late, 0.9, -0.7, 0.4]
+    parts = np.full(4, -1), kind, value, np.full(4, std**2), np.full(4, density)
+    measured = PingMeasurements(np.arange(4), *parts, *geometry, columns)
+    P = np.diag([spread**2, spread**2, 40.0**2])
+    starts = np.array([truth[:2], [-59.0, -38.0], [10.0, -60.0]])
+    law = np.ones(3, bool), 0.0, measured, starts, 4.0, wild
+    got = student_t_ping(np.append(mean, 5.0)[None], P[None], *law)
+
+    side, emission = np.arange(-80.0, 80.0, 1.0), np.arange(-120.0, 130.0, 1.0)
+    place = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2) + mean
+    square = ((place - mean) ** 2).sum(axis=1) / spread**2
+    apart = value - np.linalg.norm(place[:, None] - RECEIVERS[:, :2], axis=2)
+    weight = np.zeros(len(place))
+    for sent in emission:
+        misfit = ((apart - sent) / std) ** 2
+        fit = (1.0 - wild) * 0.375 / std * (1.0 + misfit / 4.0) ** -2.5 + wild * density
+        weight += np.exp(-0.5 * (square + ((sent - 5.0) / 40.0) ** 2)) * fit.prod(axis=1)
+    share = weight / weight.sum()
+    centre = share @ place
+    sd = np.sqrt(share @ (place - centre) ** 2)
+    assert (np.abs(got[0][0, :2] - centre) < 0.1 * sd).all()
+    ratio = np.sqrt(np.diag(got[1][0])[:2]) / sd
+    assert (ratio > 0.8).all() and (ratio < 1.2).all()
+    volume = np.log(2.0 * np.pi) * 1.5 + np.log(spread**2 * 40.0)
+    constants = 4.0 * np.log((1.0 - wild) * 0.375 / std)
+    # The weights of the residuals hold a place a little narrower than the density.
+    assert -1.2 < got[2][0] - (np.log(weight.sum()) - volume - constants) < 0.0

@@ -81,7 +81,7 @@ def test_a_bearing_is_the_same_after_a_whole_turn(turns):
     mask = np.ones(N, bool)
     for update in (
         lambda m: subset_ping(x[None], P[None], mask, 0.0, m, 0.05, 128)[:2],
-        lambda m: student_t_ping(x[None], P[None], mask, 0.0, m, x[None, :2], 4.0)[:2],
+        lambda m: student_t_ping(x[None], P[None], mask, 0.0, m, x[None, :2], 4.0, 0.02)[:2],
     ):
         for item, other in zip(update(numbers), update(turned)):
             np.testing.assert_allclose(other, item, rtol=1e-9, atol=1e-9)
@@ -125,7 +125,7 @@ def test_too_many_explanations_keep_the_best():
 def test_the_heavy_tailed_list_is_the_plain_update():
     x, P, numbers, plain = case()
     P = P + np.diag(np.arange(N) == 13) * 1e6
-    got = student_t_ping(x[None], P[None], np.ones(N, bool), 0.0, numbers, x[None, :2], 4.0)
+    got = student_t_ping(x[None], P[None], np.ones(N, bool), 0.0, numbers, x[None, :2], 4.0, 0.0)
     want = student_t_maximum(x, P, plain, [x])
     np.testing.assert_allclose(got[0][0], want.x, atol=2e-3)
     np.testing.assert_allclose(got[3][0], want.weights, atol=2e-3)
