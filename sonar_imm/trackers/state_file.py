@@ -63,7 +63,7 @@ __all__ = [
     'write_state',
 ]
 
-FORMAT = 6
+FORMAT = 7
 """Counts up when a tracker keeps other numbers than before."""
 _MAGIC = b'sonar_imm state '
 _LARGEST = 1 << 30

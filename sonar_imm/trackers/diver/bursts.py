@@ -70,6 +70,9 @@ JUMP_FLOOR = math.log(1e-3)
 SILENT = 20
 """Number of fixes in a row at one of two places after which the other one is given up."""
 
+DISTINCT = 2.0
+"""Distance of two places in turn, in standard deviations of a fix, from which they are two."""
+
 JUMP_SURE = 0.99
 """Probability of this reading at which the track moves to the fixes."""
 
@@ -330,9 +333,16 @@ def move_to_fixes(rows: Rows, chosen: BoolArray) -> Rows:
 
 
 def turning(known: Known) -> BoolArray:
-    """Return the tracks (T,) whose fixes are rather those of two places in turn."""
+    """Return the tracks (T,) whose fixes are rather those of two places in turn.
+
+    Two places nearer than `DISTINCT` standard deviations of a fix only fill the gap between two
+    covariance scales.
+    """
     rows, T = known.rows, len(known)
-    return np.asarray(rows.total(np.where(rows.key['turns'], rows.weight, 0.0), T) > 0.5)
+    variance = 0.5 * known['reported'][:, [0, 2]].sum(axis=1)
+    square = np.square(row_offsets(rows)).sum(axis=1)
+    counted = rows.key['turns'] & ~(square < DISTINCT**2 * variance[rows.target])
+    return np.asarray(rows.total(np.where(counted, rows.weight, 0.0), T) > 0.5)
 
 
 def jump(known: Known, group: Group) -> Known:

@@ -74,6 +74,9 @@ LATELY, ENOUGH = 10.0, 3.4
 DISAGREE = 25.0
 """Minimum chi-square of the difference of two means."""
 
+VISIBLE = 0.1
+"""Minimum variance of a fix, relative to that of its prediction, that innovations show."""
+
 BEGINS = 0.01
 """Weight of a row with an offset between two sensors, when it begins."""
 
@@ -111,10 +114,11 @@ def record_innovations(known: Known, group: Group, models: ModelSet) -> Known:
     )
     R = group.R[fix] * scale[:, None, None]
     # Of two places in turn, and of late stamps on a bend, innovations do not show covariances.
-    key = known.rows.key
-    other = np.where(key['turns'] | key['delay'].any(axis=1), known.rows.weight, 0.0)
-    explained = known.rows.total(other, len(known)) > 0.5
+    late = np.where(known.rows.key['delay'].any(axis=1), known.rows.weight, 0.0)
+    explained = (known.rows.total(late, len(known)) > 0.5) | bursts.turning(known)
     tentative = ((known.life.status == TENTATIVE) | explained)[tracks]
+    motion = covariance[tracks].trace(axis1=1, axis2=2)
+    hidden = R.trace(axis1=1, axis2=2) < VISIBLE * motion
     before: FixConsistency = known.memory['fixes'].of(group.number)
     white, after = whiten_innovations(
         mean[tracks],
@@ -125,7 +129,7 @@ def record_innovations(known: Known, group: Group, models: ModelSet) -> Known:
         tentative,
         before,
     )
-    after = after.with_scale(scale, tentative)
+    after = after.with_scale(scale, tentative, hidden)
     names = 'white', 'nis', 'nis_dof', 'reported', 'lately'
     columns = {name: known[name].copy() for name in names}
     columns['white'][tracks, group.number] = white

@@ -46,7 +46,7 @@ from .disagreement import begin_disagreement, record_innovations
 from .known import Feature, Known, repair_covariances
 from .models import ModelSet
 from .pairs import Association, Assumptions, Pairs
-from .scales import can_restore, lending, protected_rows, rescaled_rows
+from .scales import can_restore, lending, protected_rows, rescaled_rows, with_far_scales
 from .scan import Group
 
 FEATURES = {
@@ -332,6 +332,7 @@ def update_tracks(
         factors.append(of_models)
     sound, repairs = repair_covariances(tuple(blocks), rows.tail)
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
+    rows, borrowed = with_far_scales(rows, borrowed, sensor)
     again = can_restore(rows, borrowed) & weighed[borrowed.target]
     last = association.fix if rejected is None else np.maximum(association.fix, rejected[0])
     lend = lending(models, group, last)

@@ -72,6 +72,8 @@ class FixConsistency(NamedTuple):
     """True after a fix that states a covariance."""
     assumed: bool = False
     """True after a fix without covariance, of a sensor whose `fix_std` is not set."""
+    hidden: float = 0.0
+    """Share of the fixes whose variance is too small to show beside the motion."""
 
     def with_fixes(self, white: FloatArray, before: FloatArray) -> FixConsistency:
         """Add whitened innovations (k, 2), and those `before` (k, 2) of the same tracks, NaN for
@@ -93,14 +95,25 @@ class FixConsistency(NamedTuple):
             * (self.square + 0.5 * float(np.square(own).sum() + np.square(earlier).sum())),
         )
 
-    def with_scale(self, scale: FloatArray, tentative: BoolArray) -> FixConsistency:
-        """Add the scale (k,) estimated by tracks, of which some are `tentative` (k,)."""
+    def with_scale(
+        self, scale: FloatArray, tentative: BoolArray, hidden: BoolArray
+    ) -> FixConsistency:
+        """Add the scale (k,) estimated by tracks, of which some are `tentative` (k,).
+
+        hidden: (k,) True where the innovation is nearly all motion. The scale then stands for
+        errors of the models.
+        """
         if tentative.all():
             return self
+        share = float(hidden[~tentative].mean())
+        known = self._replace(hidden=self.hidden + (share - self.hidden) / MEMORY)
+        shown = scale[~tentative & ~hidden]
+        if not len(shown):
+            return known
         # The smallest scale counts: other tracks may follow wrong fixes.
-        least = float(scale[~tentative].min())
+        least = float(shown.min())
         evidence = max(self.evidence + math.log(min(least, MOST) / TOO_SMALL), 0.0)
-        return self._replace(scale=least, evidence=evidence)
+        return known._replace(scale=least, evidence=evidence)
 
     def with_covariances(self, stated: bool, usual: bool) -> FixConsistency:
         """Add fixes of a sensor.
@@ -133,6 +146,8 @@ class FixConsistency(NamedTuple):
         bias_stated: whether `fix_bias_std` is set.
         """
         if bias_stated or self.are_too_small or self.number < 0.99 * MEMORY:
+            return False
+        if self.hidden > 0.5:
             return False
         # Large innovations that are correlated are those of a motion that no model has.
         return self.mean_nis < (1.0 if self.lag_1 > CORRELATED else PESSIMISTIC)

@@ -31,7 +31,7 @@ import numpy as np
 
 from ...estimation import bank
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from ...estimation.rows import Borrowed, ROW_AGAIN, ROW_LOST, Rows
+from ...estimation.rows import Borrowed, normalise_weights, ROW_AGAIN, ROW_LOST, Rows
 from .known import Known, track_positions, with_velocities_at_fix
 from .models import ModelSet, USUAL_SCALES
 from .scan import Group
@@ -56,6 +56,9 @@ FARTHEST_HEARD = 400.0
 
 RESCALED, HEAVY = 8, 0.5
 """Number of fixes after which rows with an offset get other scales, and their minimum weight."""
+
+UNDECIDED = 5
+"""Number of fixes after which the usual scales are compared, at most `YOUNG`."""
 
 DELAYED = 1e-3
 """Prior of any delay of a sensor."""
@@ -371,6 +374,35 @@ def can_restore(rows: Rows, borrowed: Borrowed) -> BoolArray:
     is_published = least_scale(borrowed.key) >= MIN_PUBLISHED_SCALE
     least = np.where(is_published & (total > 0.0), total, 1.0) * ROW_AGAIN
     return np.asarray(np.exp(borrowed.logw) > least)
+
+
+def with_far_scales(rows: Rows, borrowed: Borrowed, sensor: int) -> tuple[Rows, Borrowed]:
+    """Return the rows and the list in which scales of a sensor above the usual ones have enough
+    weight for a row, for tracks of `UNDECIDED` fixes that the usual scales explain equally well.
+
+    Either the fixes are far more accurate than the motion, or only their covariances say so. A row
+    that lends shows no difference: it took the noise of the fixes for motion.
+    """
+    scale, first = rows.key['scale'][:, sensor], rows.first
+    heaviest = np.maximum.reduceat(rows.logw, first)
+    lender = np.flatnonzero(rows.logw == heaviest[rows.target])
+    is_lender = np.zeros(len(heaviest), np.bool_)
+    is_lender[rows.target[lender[rows.key['taken'][lender] == UNDECIDED]]] = True
+    usual = (scale >= MIN_PUBLISHED_SCALE) & (scale <= USUAL_SCALES[1])
+    logw = np.where(usual, rows.logw, np.nan)
+    with np.errstate(invalid='ignore'):
+        spread = np.fmax.reduceat(logw, first) - np.fmin.reduceat(logw, first)
+    count = np.add.reduceat(usual.astype(np.int64), first)
+    undecided = is_lender & (count > 1) & (spread < np.log(2.0))
+    if not undecided.any() or not len(borrowed):
+        return rows, borrowed
+    far = borrowed.key['scale'][:, sensor] > USUAL_SCALES[1]
+    values = borrowed.key['scale'][far, sensor].tolist()
+    chosen = far & usual_assumptions(rows, borrowed, values, sensor)
+    chosen &= undecided[borrowed.target]
+    least = heaviest[borrowed.target] + np.log(2.0 * ROW_AGAIN)
+    logw = np.where(chosen, np.maximum(borrowed.logw, least), borrowed.logw)
+    return normalise_weights(rows, evolve(borrowed, logw=logw))
 
 
 def weight_without_small_scales(rows: Rows) -> FloatArray:

@@ -12,8 +12,10 @@ The filter says how much more probable a record is than one of noise alone. Nois
 
     log p = -N (log sigma + mean(a^2) / (2 sigma^2))
 
-up to a constant, with N independent samples, so that the noise can be fitted, too. The particles
-leave a noise of their own in the sum, against which the differences of the curvature are wide.
+up to a constant, with N independent samples, so that the noise can be fitted, too. The mean is
+over the samples of the trace: the depths between them, which a small `depth_std` needs, are no
+data. The particles leave a noise of their own in the sum, against which the differences of the
+curvature are wide.
 """
 
 from __future__ import annotations
@@ -84,16 +86,19 @@ class Scored(FathometerTracker):
 
     def __init__(self, config: FathometerConfig, measurements: Sequence[Any] = ()):
         self.scores: Scores = {}
+        self._trace_step = next((m.step for m in measurements if isinstance(m, Trace)), 0.0)
         super().__init__(config)
 
     def _filtered(self, response: Response) -> tuple[Response, SetStep, int, Pace]:
         response, step, records, pace = super()._filtered(response)
         gained = step.log_evidence if step.ok else UNEXPLAINED
-        seen = response.amplitude != 0.0
         assert self._lattice is not None
-        span, width = self._lattice.step * self._lattice.cells, 0.25 * self._lattice.step
+        every = max(1, round(self._trace_step / self._lattice.step))
+        amplitude, sigma = response.amplitude[::every], response.sigma[::every]
+        span, width = self._lattice.step * self._lattice.cells, 0.25 * every * self._lattice.step
         independent = independent_samples(response.pulse or self.pulse, span, width)
-        sigma, amplitude = response.sigma[seen], response.amplitude[seen]
+        seen = amplitude != 0.0
+        sigma, amplitude = sigma[seen], amplitude[seen]
         noise = np.log(sigma) + 0.5 * np.square(amplitude / sigma)
         alone = -independent * float(np.mean(noise)) if seen.any() else 0.0
         self.scores[response.stamp_ns] = gained + alone, 1

@@ -13,7 +13,7 @@ import pytest
 
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
-from sonar_imm_tools.evaluation.fathometer.predictive import tunables
+from sonar_imm_tools.evaluation.fathometer.predictive import for_tuning, Scored, tunables
 
 
 def names(sigma=None, **values):
@@ -31,3 +31,24 @@ def test_the_width_of_a_pulse_that_has_one_is_tuned(pulse, more):
 
 def test_the_noise_of_traces_that_do_not_state_it_is_tuned():
     assert names(noise_sigma=0.5, pulse='auto') == ['noise_sigma', *ALWAYS]
+
+
+def test_depths_between_the_samples_of_a_trace_are_no_data():
+    """A small `depth_std` needs a finer grid: noise alone stays as probable as it was."""
+    rng, depth = np.random.default_rng(4), np.arange(100.0, 160.0, 0.1)
+    traces = [
+        Trace(
+            stamp_ns=k * 10**9,
+            depth=depth,
+            amplitude=0.3 * rng.normal(size=len(depth)),
+            sigma=np.full(len(depth), 0.3),
+        )
+        for k in range(1, 6)
+    ]
+    totals = []
+    for std in (0.2, 0.01):
+        tracker = Scored(for_tuning(FathometerConfig(depth_std=std, particles=500)), traces)
+        for trace in traces:
+            tracker.process(trace)
+        totals.append(sum(score for score, _ in tracker.scores.values()))
+    assert totals[1] == pytest.approx(totals[0], abs=15.0)

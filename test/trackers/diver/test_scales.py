@@ -99,6 +99,48 @@ def test_covariances_that_are_far_too_small_cost_nothing_and_the_factor_is_named
     assert len(tracker._stream.state.rows) <= 4
 
 
+def steer(seed, std, stated, count=60):
+    """Fixes each second of a boat at 6 m/s that turns, and the positions (count, 2)."""
+    rng = np.random.default_rng([seed, 6])
+    rate = np.repeat(np.deg2rad(8.0) * rng.choice([-1.0, 0.0, 1.0], count // 10), 10)
+    heading = np.cumsum(rate)
+    truth = np.cumsum(6.0 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+    z = truth + std * rng.normal(size=truth.shape)
+    return [fix(k, *each, stated**2 * np.eye(2)) for k, each in enumerate(z, start=1)], truth
+
+
+@pytest.mark.parametrize('std', [1.0, 0.01])
+def test_of_a_boat_a_centimetre_that_is_a_metre_is_found_and_a_true_one_left(std):
+    """Both look like fixes far more accurate than the boat moves, at first."""
+    scales, squares, warned = [], [], 0
+    for seed in range(6):
+        items, truth = steer(seed, std, 0.01)
+        tracker = DiverTracker(DiverConfig(max_tracks=1, target='boat'))
+        for item, place in zip(items, truth):
+            (estimate,) = tracker.process(item)
+            if item.stamp_ns > 25 * 10**9:
+                error = estimate.state[0, :2] - place
+                squares.append(error @ np.linalg.solve(estimate.covariance[0, :2, :2], error))
+        scales.append(estimate.extras['covariance_scale'][0])
+        said = tracker.warnings()
+        assert len(said) == (std == 1.0), said
+        warned += sum(text.startswith(WARNED) for text in said)
+    if std == 1.0:
+        assert 1e3 < np.median(scales) < 1e5 and warned >= 5
+    else:
+        assert max(scales) <= 10.0
+    assert np.mean(squares) < 4.0
+
+
+def test_covariances_six_times_too_small_are_not_taken_for_two_sensors():
+    """Two places nearer than a fix scatters would fill the gap between the scales 3 and 10."""
+    for seed in range(4):
+        tracker = DiverTracker(DiverConfig(max_tracks=1))
+        for item in swim(seed, count=200, stated=1.0 / 6.0)[0]:
+            tracker.process(item)
+        assert not any('two groups' in text for text in tracker.warnings())
+
+
 def test_beyond_the_last_scale_no_factor_is_named():
     items, truth = swim(4, stated=1e-6)
     rmse, _, tracker = scored(items, truth, first=40)
