@@ -98,7 +98,6 @@ SOAK: dict[str, Callable[[Row], str]] = {
     'slope, MB/h': _plain('slope_mb_per_h', '.3f'),
     'p99 first tenth, ms': _plain('p99_first_ms', '.2f'),
     'p99 last tenth, ms': _plain('p99_last_ms', '.2f'),
-    'not counted': _plain('uncounted', '.0f'),
 }
 MESSAGES = {
     'fixes': '`fixes`: 10,000 of one scan, at random, `association: gnn`',
@@ -337,17 +336,16 @@ def _part(file: Path) -> Any:
 
 
 def _about(run: Mapping[str, Row]) -> str:
-    """The run in a sentence, and how many minutes each part took."""
-    seconds = {name: of['seconds'] for name, of in run.items()}
+    """Return the run in a sentence."""
+    seconds = sum(of['seconds'] for of in run.values())
     (last, *_) = sorted((of['date'] for of in run.values()), reverse=True)
     processors = max(of['processors'] for of in run.values())
     commits = sorted({commit for of in run.values() for commit in of['commits']})
     shares = sorted({of['share'] for of in run.values()})
-    each = ', '.join(f'`{name}` {seconds[name] / 60.0:.1f}' for name in PARTS if name in seconds)
     return (
-        f'One run of {last}, {sum(seconds.values()) / 60.0:.0f} minutes on {processors} '
+        f'One run of {last}, {seconds / 60.0:.0f} minutes on {processors} '
         f'processors, of {" and ".join(f"`{commit}`" for commit in commits)}, `SHARE` '
-        f'{" and ".join(f"{share:g}" for share in shares)}; minutes of each part: {each}.'
+        f'{" and ".join(f"{share:g}" for share in shares)}.'
     )
 
 

@@ -47,6 +47,9 @@ from sonar_imm_tools.recordings.own_files import write_own_limit
 SHARE = 0.9
 """Of the runs that are within the limit of `check`."""
 
+SHOWN = ('of the seed', 'median', '5 %', '95 %')
+"""Columns of README.md; the command prints all."""
+
 
 @frozen
 class Typical:
@@ -119,28 +122,23 @@ def readme(given: argparse.Namespace, found: Typical, limit: Limit, failed: int)
     again += [text for metric in given.metric for text in ('--metric', metric)]
     again += [*given.compress, '--write', f'bags/{name}']
     first = next(iter(found.spread))
-    own = found.spread[first]['of the seed']
     what = limit.meaning if first == limit.metric else f'`{first}`'
+    shown = {
+        metric: {column: row[column] for column in SHOWN} for metric, row in found.spread.items()
+    }
     return '\n'.join(
         [
             f'# {name}',
             '',
-            'A simulated recording with its truth:',
-            '',
             f'    {" ".join(command)}',
             '',
-            f'Its seed is typical: of seeds {given.seed} to {given.seed + given.runs - 1} the one '
-            'in the middle'
-            + (
-                f' by {what}, {own:.2f} {limit.unit}.'
-                if len(found.spread) == 1
-                else ' by all errors below.'
-            )
+            f'Of seeds {given.seed} to {given.seed + given.runs - 1} the middle one by '
+            + (f'{what}.' if len(shown) == 1 else 'all errors below.')
             + (f' {failed} runs failed.' if failed else ''),
-            f'`sonar-imm check {given.system}` allows {found.limit:g} {limit.unit} ({what}), '
-            f'which {100 * SHARE:.0f} % of these runs stay below.',
+            f'`sonar-imm check {given.system}` allows {found.limit:g} {limit.unit}; '
+            f'{100 * SHARE:.0f} % of these runs stay below.',
             '',
-            markdown(found.spread),
+            markdown(shown),
             '',
             f'    {" ".join(again)}',
             '',

@@ -22,7 +22,7 @@ import textwrap
 
 import yaml
 
-from sonar_imm.node_config import DetectorNodeConfig, node_config_type
+from sonar_imm.node_config import DetectorNodeConfig, node_config_type, NodeConfig
 from sonar_imm.parameters import markdown_table, ParameterSpec
 from sonar_imm.trackers import System, SYSTEMS
 from sonar_imm.trackers.obstacle.detector import DetectorConfig
@@ -45,10 +45,8 @@ YAML_HEAD = """\
 MARKDOWN = """\
 # Parameters of the {what}
 
-{summary}.
-Written by `make docs` from the configuration classes, as is `config/{name}.yaml`, ready to copy.
-*Live* parameters may change while the node runs, and tracks are kept. A default with a decimal
-point is a double, one without an integer, one in quotes a string.
+{summary}. `config/{name}.yaml` holds all of them with their ranges, ready to copy.
+Those with a star may change while the node runs. [Types of values](nodes.md).
 
 ## The ten that matter
 
@@ -58,83 +56,83 @@ point is a double, one without an integer, one in quotes a string.
 {tracker}
 ## Node
 
-The live node takes these besides, and [those of every node](nodes.md). Recordings state the
-types of their messages.
-
 {node}"""
 
 NODES = """\
 # Parameters of every node
 
-Written by `make docs` from the configuration classes. Offline tracking ignores them. A wrong value
-is refused with one sentence, a misspelt name is warned about.
+Offline tracking ignores them. A wrong value is refused with one sentence, a misspelt name gives a
+warning. A default with a decimal point is a double, one without an integer, one in quotes a
+string.
 
 {node}"""
 
 DETECTOR = (
-    'Echoes in images of a forward-looking sonar, for the obstacle tracker. Offline the same '
-    'parameters are taken from the section `fls_detector` of a parameter file, and from `--set`'
+    'Echoes in images of a forward-looking sonar, for the obstacle tracker. Offline: section '
+    '`fls_detector` of a parameter file, or `--set`'
 )
 
 # Parameters that most users set, and when; everything else holds for most sonars.
 MATTER = {
     'diver': {
-        'fix_std': 'fixes state no covariance: the standard deviation of one, per axis',
-        'covariance_scale': 'a warning says that fixes scatter more, or less, than they state',
+        'fix_std': 'fixes state no covariance',
+        'covariance_scale': 'a warning says that fixes scatter more, or less, than stated',
         'target': 'not a diver: `rov`, `fish`, `boat` or `ship`',
-        'dimensions': '3 when the depth is wanted, from fixes with z or from arrival times',
-        'detection_probability': 'divers are seen in fewer, or more, scans than nine of ten',
-        'clutter_density': 'false fixes per square metre and scan, when you know them',
-        'coverage_sector': 'the sensor sees a sector only: a target outside of it is not deleted',
-        'sound_speed': 'arrival times: that of your water; with `sound_speed_std` if unsure',
+        'dimensions': '3 for the depth, from fixes with z or from arrival times',
+        'max_tracks': '1 when a single target is there',
+        'detection_probability': 'not nine of ten scans show a target',
+        'clutter_density': 'the density of false fixes is known',
+        'coverage_sector': 'the sensor sees a sector only',
+        'sound_speed': 'arrival times; with `sound_speed_std` if unsure',
         'receiver_position_std': 'arrival times: how well receivers were surveyed',
     },
     'obstacle': {
         'sonar_lever': 'where the sonar sits on the vehicle',
         'sonar_mount_rpy_deg': 'how it is turned there; a pitch of some degrees is usual',
-        'bearing_positive': 'bearings that grow to starboard',
-        'vertical_fov_deg': 'the vertical opening of the beam',
-        'max_range': 'the range that the sonar is set to',
+        'bearing_positive': 'bearings grow to starboard',
+        'vertical_fov_deg': 'vertical opening of the beam',
+        'horizontal_fov_deg': 'width of the sector',
+        'max_range': 'range that the sonar is set to',
         'range_std': 'detections state no variance; `bearing_std_deg` likewise',
-        'detection_probability': 'most obstacles are seen in fewer than nine of ten pings',
+        'detection_probability': 'not nine of ten pings show an obstacle',
         'navigation_grade': 'nav is worse than an inertial system with a DVL',
-        'safety_radius': 'which distance a collision is counted from; with `safety_height`',
+        'safety_radius': 'distance of a collision; with `safety_height`',
     },
     'bathymetry': {
-        'sonar_height': 'the height above the sea floor at the start, unless altitudes come',
+        'sonar_height': 'height at the start, unless altitudes come',
         'side': '`port` for an array that looks there',
-        'tilt_deg': 'the tilt of the array below the horizon',
+        'tilt_deg': 'tilt of the array below the horizon',
         'element_spacing_wavelengths': 'staves are not half a wavelength apart',
-        'conjugate': 'the floor comes out mirrored: the phase has the other sign',
-        'sound_speed_profile': 'rays bend: depths and speeds of a cast; else `sound_speed`',
-        'noise_variance': 'measured in the water column if 0; state it when that is not clean',
+        'conjugate': 'the floor comes out mirrored',
+        'sound_speed_profile': 'rays bend; else `sound_speed`',
+        'noise_variance': 'the water column is not clean',
         'sonar_lever': 'where the array sits on the ship; with `sonar_mount_rpy_deg`',
-        'layover': '`resolved` for both surfaces of a ledge, four staves or more',
-        'attitude_std_deg': 'how good the motion sensor is: the error of soundings has it',
+        'layover': '`resolved` for both surfaces of a ledge',
+        'attitude_std_deg': 'quality of the motion sensor',
     },
     'fathometer': {
-        'phones': 'the number of hydrophones of the array',
+        'phones': 'hydrophones of the array',
         'element_spacing': 'metres between them',
-        'frequency_max': 'the highest frequency that is processed; with `frequency_min`',
-        'array_depth': 'the depth of the array, unless it is published; reflectors are below it',
-        'depth_min': 'where the window of depths begins; with `depth_max`',
-        'sound_speed': 'that of the water; with `sound_speed_std`, which depths contain',
-        'order_max': 'the largest number of reflectors at a time',
-        'polarity': '`both` where a layer may be softer than what lies above it',
-        'pulse_width': 'traces of an instrument: the width of its pulse',
-        'record_seconds': 'sound of a vertical array: seconds averaged into one record',
+        'frequency_max': 'processed band; with `frequency_min`',
+        'array_depth': 'unless it is published; reflectors are below it',
+        'depth_min': 'window of depths; with `depth_max`',
+        'sound_speed': 'of the water; with `sound_speed_std`',
+        'order_max': 'more reflectors at a time',
+        'polarity': '`both` where a layer may be softer than the one above',
+        'pulse_width': 'traces of an instrument: width of its pulse',
+        'record_seconds': 'sound of a vertical array: seconds in one record',
     },
     'fls_detector': {
         'image_scale': 'samples are powers, or levels in decibels',
         'image_order': 'all ranges of a beam come together',
         'image_near_range': 'images state no ranges; with `image_far_range` and `image_fov_deg`',
         'image_first_beam': 'images state no bearings and begin to starboard',
-        'beam_width_deg': 'the width of a beam of your sonar',
-        'range_resolution': 'the length of the echo of a point',
-        'threshold_margin_db': 'too many false echoes on a rough floor, or too few echoes',
+        'beam_width_deg': 'width of a beam of your sonar',
+        'range_resolution': 'length of the echo of a point',
+        'threshold_margin_db': 'too many false echoes, or too few echoes',
         'join_distance': 'one obstacle gives several echoes, or two give one',
         'min_range': 'echoes of the own vehicle reach farther',
-        'sweep_sector_deg': 'a scanning sonar: the sector ahead that is used',
+        'sweep_sector_deg': 'a scanning sonar: sector that is used',
     },
 }
 
@@ -142,8 +140,7 @@ MATTER = {
 def generated() -> dict[str, str]:
     """Give every generated file: its text by its path below the project root."""
     files = {}
-    shared = shared_specs()
-    files['docs/parameters/nodes.md'] = NODES.format(node=markdown_table(shared))
+    files['docs/parameters/nodes.md'] = NODES.format(node=markdown_table(NodeConfig.specs()))
     for system in SYSTEMS.values():
         tracker = system.config_type().specs()
         files[f'config/{system.name}.yaml'] = parameter_file(system)
@@ -154,7 +151,7 @@ def generated() -> dict[str, str]:
             summary=system.summary[0].upper() + system.summary[1:],
             matter=matter_table(system.name, tracker),
             tracker=markdown_table(tracker),
-            node=markdown_table(spec for spec in node_specs(system) if spec not in shared),
+            node=of_this_node(node_specs(system)),
         )
     detector = DetectorConfig.specs()
     node = DetectorNodeConfig.specs()
@@ -166,19 +163,20 @@ def generated() -> dict[str, str]:
         summary=DETECTOR,
         matter=matter_table('fls_detector', detector),
         tracker=markdown_table(detector),
-        node=markdown_table(spec for spec in node if spec not in shared),
+        node=of_this_node(node),
     )
     return files | pages()
 
 
 def matter_table(name: str, specs: Sequence[ParameterSpec]) -> str:
     """The parameters that most users set, in the order in which they meet them."""
-    found = {spec.name: spec for spec in specs}
-    rows = ['| parameter | default | when to set it |', '|---|---|---|']
+    known = {spec.name for spec in specs}
+    rows = ['| parameter | when to set it |', '|---|---|']
     for parameter, when in MATTER[name].items():
-        default = json.dumps(found[parameter].default)
-        rows.append(f'| `{parameter}` | `{default}` {found[parameter].unit} | {when} |')
-    return '\n'.join(rows).replace('`  |', '` |') + '\n'
+        if parameter not in known:
+            raise LookupError(f'{name} has no parameter {parameter}')
+        rows.append(f'| `{parameter}` | {when} |')
+    return '\n'.join(rows) + '\n'
 
 
 def parameter_file(system: System) -> str:
@@ -196,10 +194,23 @@ def node_specs(system: System) -> tuple[ParameterSpec, ...]:
     return tuple(spec for spec in node_config_type(system).specs() if spec.name not in own)
 
 
-def shared_specs() -> tuple[ParameterSpec, ...]:
-    """Give the parameters that the live nodes of all systems have alike."""
-    first, *others = (node_config_type(system).specs() for system in SYSTEMS.values())
-    return tuple(spec for spec in first if all(spec in other for other in others))
+def of_this_node(specs: Sequence[ParameterSpec]) -> str:
+    """Give what a node has of its own: other defaults, other meanings, further parameters."""
+    shared = {spec.name: spec for spec in NodeConfig.specs()}
+    own = [
+        spec
+        for spec in specs
+        if spec.name not in shared or spec.description != shared[spec.name].description
+    ]
+    defaults = [
+        f'`{spec.name}` is `{json.dumps(spec.default)}` {spec.unit}'.rstrip()
+        for spec in specs
+        if spec not in own and spec.default != shared[spec.name].default
+    ]
+    common = [f'`{spec.name}`' for spec in specs if spec not in own]
+    those = 'Those' if len(common) > 5 else ' and '.join(common)
+    parts = [f'{"; ".join([f"{those} of [every node](nodes.md)", *defaults])}.\n']
+    return '\n'.join([*parts, *([markdown_table(own)] if own else [])])
 
 
 def _entry(spec: ParameterSpec) -> str:

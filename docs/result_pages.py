@@ -76,7 +76,7 @@ class Numbers:
     def made(self, file: str) -> str:
         """Return a link to a file with the day and the commit of its numbers."""
         made = self.at(f'{file}>made')
-        return f'[{file}.json]({file}.json), {made["date"]}, commit {made["commit"]}'
+        return f'[{file}.json]({file}.json), {made["date"]}, {made["commit"]}'
 
     def table(
         self,

@@ -207,7 +207,7 @@ def recordings() -> str:
             continue
         head, _, first = ([cell.strip() for cell in line.split('|')[1:-1]] for line in lines[:3])
         found = dict(zip(head[1:], first[1:]))
-        (limit,) = re.findall(r'allows (\S+ \S+)', text)[:1]
+        (limit,) = re.findall(r'allows (\S+ \w+)', text)[:1]
         rows.append(
             f'| [{name}](#{name}) | {seed} | `{first[0]}` | {found["of the seed"]} | '
             f'{found["5 %"]} to {found["95 %"]} | {limit} |'

@@ -73,6 +73,7 @@ GONE: dict[str, str] = {
     },
     'parameter sweep_speed': 'was removed: each direction counts at its own time',
     'parameter publish_revisions': 'was removed: max_revisions 0 leaves revisions out',
+    'parameter queue_depth': 'was removed: set qos_overrides.TOPIC.subscription.depth',
     'parameter diagnostics_period': _CONSTANT,
     'parameter state_interval': _CONSTANT,
     'parameter use_tf_static': 'was removed: remap /tf_static for a node that must not hear it',
@@ -102,8 +103,14 @@ GONE: dict[str, str] = {
             *('array_depth_age', 'heave_memory', 'white_noise_gain_db', 'depth_step'),
             *('slope_switch_probability', 'negative_probability', 'amplitude_memory'),
             'track_memory',
+            *('training', 'training_beams', 'guard', 'growth_false_alarm', 'sweep_max_gap'),
+            *('phone_least_share', 'fish_rate', 'bottom_jump', 'detectable_sigmas'),
         )
     },
+    'parameter false_alarm': (
+        'was removed: set threshold_margin_db; 1e-3 was 3 dB below the default, 1e-9 1.8 dB above'
+    ),
+    'parameter remove_background': 'was removed: envelopes are found (parameter water)',
     **{f'parameter {name}': _LIFE for name in ('confirm_window', 'delete_misses')},
     'parameter sector_edge_deg': 'was removed: the edges of the beam are smeared by 1.2 degrees',
     'parameter outlier_probability': (

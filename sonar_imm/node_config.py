@@ -17,7 +17,7 @@ from attrs import frozen
 from msg_adapters.inputs import inputs_of
 
 from .acoustics.geodesy import Origin
-from .parameters import Config, ConfigError, did_you_mean, inherited, live, parameter
+from .parameters import Config, ConfigError, constant, did_you_mean, inherited, live, parameter
 from .trackers import System
 from .trackers.shared_parameters import OriginParameters
 
@@ -27,39 +27,38 @@ class NodeConfig(Config):
     """Parameters of every node besides those of its tracker."""
 
     # fmt: off
-    queue_depth: int = parameter(50, '',
+    # ROS 2 has a parameter for it, qos_overrides.TOPIC.subscription.depth.
+    queue_depth: int = constant(50, '',
         'messages that an input queue holds while the tracker is busy', range=(1, 100000))
     max_wait: float = live(0.0, 's',
-        'messages that waited longer for a busy tracker are dropped and counted; 0: never',
+        'messages that waited longer are dropped and counted; 0: never',
         range=(0.0, 1e6))
     frame_id: str = parameter('', '',
         'frame that the input must be in; empty: the frame of the first message accepted')
     world_frame_convention: str = parameter('enu', '',
-        'axes of the input: enu (world x east, y north, z up; vehicle x forward, y port, z up) or '
-        'ned (world x north, y east, z down; vehicle x forward, y starboard, z down); the output '
-        'is always enu', choices=('enu', 'ned'))
+        'axes of the input: enu (world east, north, up; vehicle forward, port, up) or ned '
+        '(north, east, down; forward, starboard, down); the output is always enu',
+        choices=('enu', 'ned'))
     input_types: tuple[str, ...] = parameter((), '',
-        'message types of inputs that have several, as <input>=<type>, e.g. '
-        'fix=geometry_msgs/msg/PointStamped; an input that is not named: its first type in '
-        'docs/topics.md', kind='str[]')
+        'message types of inputs that have several, e.g. fix=geometry_msgs/msg/PointStamped; '
+        'else the first type in docs/topics.md', kind='str[]')
     max_revisions: int = live(100, '',
-        'most estimates that one late message changed and that are published again, oldest '
-        'first; others are counted; 0: only the newest estimate is published',
+        'most estimates, changed by one late message, that are published again, oldest first; 0: '
+        'only the newest estimate',
         range=(0, 1_000_000))
     autostart: bool = parameter(True, '',
-        'configure and activate the node when it starts; false: a lifecycle manager or '
-        '`ros2 lifecycle set` does')
+        'configure and activate at the start; false: a lifecycle manager or `ros2 lifecycle set` '
+        'does')
     stale_after: float = live(10.0, 's',
         'time after which diagnostics call an input stale', range=(0.01, 1e6))
     max_age: float = live(0.0, 's',
-        'age of the newest estimate above which diagnostics warn; 0: one second, or three periods '
-        'of the estimates, whichever is longer', range=(0.0, 1e6))
+        'age of the newest estimate above which diagnostics warn; 0: one second, or three '
+        'periods of the estimates if that is longer', range=(0.0, 1e6))
     state_file: str = parameter('', '',
-        'file that keeps the state of the tracker, so that a node started again continues its '
-        'tracks; empty: none')
+        'file that keeps the state, so that a restarted node continues its tracks; empty: none')
     state_max_age: float = parameter(300.0, 's',
-        'the state in state_file is not used when saved longer ago than this, or further than '
-        'this from the first measurement', range=(0.0, 1e6))
+        'state_file is not used when saved longer ago than this, or further from the first '
+        'measurement', range=(0.0, 1e6))
     # fmt: on
 
     def stated_origin(self) -> Origin | None:
@@ -82,7 +81,7 @@ class TracksNodeConfig(NodeConfig):
     Whoever steers by a track needs the one of now."""
 
     # fmt: off
-    queue_depth: int = inherited(NodeConfig, 'queue_depth', 500)
+    queue_depth: int = inherited(NodeConfig, 'queue_depth', 500, constant=True)
     max_wait: float = inherited(NodeConfig, 'max_wait', 2.0)
     # fmt: on
 
@@ -97,8 +96,7 @@ class DetectorNodeConfig(Config):
     """Parameters of the node that detects echoes in images, besides those of the detector."""
 
     # fmt: off
-    queue_depth: int = inherited(NodeConfig, 'queue_depth', 10,
-        description='images that an input queue holds while the node is busy', range=(1, 1000))
+    queue_depth: int = inherited(NodeConfig, 'queue_depth', 10, constant=True)
     autostart: bool = inherited(NodeConfig, 'autostart', True)
     input_types: tuple[str, ...] = inherited(NodeConfig, 'input_types', (),
         description='message type of the images, e.g. image=sensor_msgs/msg/Image; empty: '

@@ -433,18 +433,19 @@ def _sections(tree: Mapping[Any, Any], before: str) -> Iterable[str]:
 
 
 def markdown_table(specs: Iterable[ParameterSpec]) -> str:
-    """The table of `specs` for the documentation, one row a parameter; *live* ones may change
-    while a node runs. Choices that the description explains are not listed besides."""
-    rows = ['| parameter | default, range | what |', '|---|---|---|']
+    """Return the table of `specs` for the documentation, one row a parameter; a star marks those
+    that may change while a node runs. Ranges are in the parameter file. Choices that the
+    description explains are not listed besides."""
+    rows = ['| parameter | default | what |', '|---|---|---|']
     for spec in specs:
-        between = spec.range_text().removeprefix('between ').replace(' and ', ' to ')
         words = set(re.findall(r'\w+', spec.description))
         listed = () if words.issuperset(spec.choices) else spec.choices
-        limits = ', '.join(f'`{choice}`' for choice in listed) or between
         kind = f'{spec.ros_kind} ' if spec.ros_kind.endswith('[]') else ''
-        text = spec.description + ('' if spec.read_only else ' (*live*)')
         value = f'{kind}`{json.dumps(spec.default)}` {spec.unit}'.rstrip()
-        rows.append(f'| `{spec.name}` | {"; ".join(filter(None, (value, limits)))} | {text} |')
+        choices = ', '.join(f'`{choice}`' for choice in listed)
+        name = f'`{spec.name}`' + ('' if spec.read_only else r'\*')
+        default = '; '.join(filter(None, (value, choices)))
+        rows.append(f'| {name} | {default} | {spec.description} |')
     return '\n'.join(rows) + '\n'
 
 

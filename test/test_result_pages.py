@@ -51,7 +51,7 @@ def test_what_only_some_files_hold_can_be_asked_for(numbers):
     assert numbers.has('x>scenes>calm') and numbers.keys('x>scenes', 'ou') == ['rough']
     for path in ('x>scenes>storm', 'x>runs>RMSE', 'y>scenes'):
         assert not numbers.has(path) and numbers.keys(path) == []
-    assert numbers.sources() == '[x.json](x.json), 2026-11-29, commit abcd1234'
+    assert numbers.sources() == '[x.json](x.json), 2026-11-29, abcd1234'
 
 
 @pytest.mark.parametrize('path', ['x>scenes>storm>RMSE', 'x>runs>RMSE', 'x>all>2', 'x>all>first'])
@@ -65,7 +65,7 @@ def test_a_table_has_a_row_for_each_entry_and_a_caption(numbers):
     assert numbers.table('x>scenes>{row}>{col}', columns, first='scene') == (
         '| scene | RMSE, m | inside |\n|---|---|---|\n'
         '| calm | 0.123 | 50 % (-) |\n| rough | - | 25 % (0.90) |\n\n'
-        '<small>[x.json](x.json), 2026-11-29, commit abcd1234</small>'
+        '<small>[x.json](x.json), 2026-11-29, abcd1234</small>'
     )
     assert numbers.sources() == ''
     short = numbers.table('x>{col}', {'share': 'scenes>@>share'}, {'a': 'rough'}, caption=False)

@@ -113,8 +113,8 @@ def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, flo
     """x, y, z, w of `rotation`.
 
     >>> import numpy as np
-    >>> [round(part, 3) for part in quaternion(0.0, 0.0, np.pi / 2)]
-    [0.0, 0.0, 0.707, 0.707]
+    >>> tuple(round(part, 3) for part in quaternion(0.0, 0.0, np.pi / 2))
+    (0.0, 0.0, 0.707, 0.707)
     """
     (sr, cr), (sp, cp), (sy, cy) = (
         (np.sin(0.5 * angle), np.cos(0.5 * angle)) for angle in (roll, pitch, yaw)

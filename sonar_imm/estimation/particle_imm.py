@@ -22,7 +22,8 @@
 ...     log_likelihood=echo,
 ...     rng=rng,
 ... )
->>> [floor.step(z) for z in (20.0, 20.1, None, 20.0, 22.4, 23.9)][-1]  # m; None: no echo
+>>> steps = [floor.step(z) for z in (20.0, 20.1, None, 20.0, 22.4, 23.9)]  # m; None: no echo
+>>> steps.pop()
 'used'
 >>> floor.estimate.mean.round(0).tolist(), floor.model_probabilities.round(1).tolist()
 ([24.0], [0.0, 1.0])

@@ -244,9 +244,11 @@ class Endpoints:
     def _warn_of_loss(self, topic: str) -> None:
         if topic not in self._warned:
             self._warned.add(topic)
+            name = self._node.resolve_topic_name(topic)
             self._node.get_logger().warning(
-                f"messages on '{topic}' are lost before the node can read them: raise queue_depth "
-                'or slow the sender down (said once, counted in /diagnostics)'
+                f"messages on '{topic}' are lost before the node can read them: set -p "
+                f'qos_overrides.{name}.subscription.depth:=1000 or slow the sender down (said '
+                'once, counted in /diagnostics)'
             )
 
 

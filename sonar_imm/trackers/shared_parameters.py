@@ -44,11 +44,11 @@ class MountingParameters(Config):
 
     # fmt: off
     vehicle_frame: str = parameter('', '',
-        'frame in which the poses of nav are, e.g. base_link; needed together with sonar_frame')
+        'frame of the poses of nav, e.g. base_link; together with sonar_frame')
     sonar_frame: str = parameter('', '',
-        'frame of the sonar (x forward, y port, z up): with it and vehicle_frame, sonar_lever and '
-        'sonar_mount_rpy_deg are taken from /tf_static, and pings before that are refused; empty: '
-        'as those two parameters say')
+        'frame of the sonar (x forward, y port, z up): with vehicle_frame, /tf_static gives '
+        'sonar_lever and sonar_mount_rpy_deg, and earlier pings are refused. Empty: as those two '
+        'parameters say')
     # fmt: on
 
     def check(self) -> list[str]:
@@ -64,8 +64,8 @@ class OriginParameters(Config):
 
     # fmt: off
     origin: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'deg, deg, m',
-        'latitude, longitude and height above the ellipsoid of the origin of the frame of the '
-        'tracks; with both latitude and longitude 0: not known')
+        'latitude, longitude and height above the ellipsoid of the origin of the tracks; both 0: '
+        'unknown')
     # fmt: on
 
     def check(self) -> list[str]:
@@ -118,6 +118,6 @@ class StreamParameters(StampParameters):
 
     # fmt: off
     history: float = parameter(10.0, 's',
-        'how late a measurement may arrive and still be used, in the order of the stamps',
+        'how late a measurement may arrive and still be inserted at its stamp',
         range=(0.0, 3600.0))
     # fmt: on

@@ -48,4 +48,4 @@ def test_the_text_names_the_command_the_seeds_and_the_limit():
     found = typical(outcomes(**{'position.rmse_m': [5.0, 1.0, 3.0, 2.0, 4.0]}), given.metric)
     text = readme(given, found, Limit(1.0, 'm', 'position RMSE', 'position.rmse_m'), 0)
     assert 'simulate diver bags/diver_table1 --scenario table1 --seed 3 --set speed=2' in text
-    assert 'of seeds 1 to 5' in text and 'allows 4.6 m' in text and 'somewhere' not in text
+    assert 'Of seeds 1 to 5' in text and 'allows 4.6 m' in text and 'somewhere' not in text

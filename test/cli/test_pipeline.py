@@ -165,7 +165,7 @@ def test_convert_tells_what_it_left_out(call, tmp_path, capsys):
 
 def test_the_node_parameters_of_a_file_are_checked_and_ignored(call, dive, tmp_path, capsys):
     params = tmp_path / 'diver.yaml'
-    params.write_text('input_types: [fix=geometry_msgs/msg/PointStamped]\nqueue_depth: 7\n')
+    params.write_text('input_types: [fix=geometry_msgs/msg/PointStamped]\nstale_after: 7.0\n')
     run = call('track', dive, tmp_path / 'out', '--params', params)
     assert 'input_types' not in run['parameters'] and run['estimates'] == 58
     params.write_text('input_types: [fix=geometry_msgs/msg/PointStampd]\n')

@@ -50,14 +50,14 @@ def test_a_recording_keeps_no_files_and_changes_no_node(bag, node, capsys):
     own = state(
         bag,
         'state_file: /etc/passwd',
-        'queue_depth: 1',
+        'stale_after: 1.0',
         'fix_std: 2.5',
         'frame_id: sea',
         node=node,
     )
     tracker, settings = config_of(own)
     assert (tracker.fix_std, settings.frame_id) == (2.5, 'sea')
-    assert settings.state_file == '' and settings.queue_depth != 1
+    assert settings.state_file == '' and settings.stale_after != 1.0
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and "'state_file' is not used" in lines[0]
 
@@ -142,9 +142,9 @@ def test_what_the_user_names_is_trusted(bag, tmp_path, capsys):
     file.write_text(
         f'diver:\n  ros__parameters:\n    coverage_file: {tmp_path}/beam.csv\n    state_file: s\n'
     )
-    tracker, node = load_config(SYSTEMS['diver'], file, {'queue_depth': '7'})
+    tracker, node = load_config(SYSTEMS['diver'], file, {'stale_after': '7.0'})
     assert tracker.coverage_file == f'{tmp_path}/beam.csv'
-    assert (node.state_file, node.queue_depth) == ('s', 7)
+    assert (node.state_file, node.stale_after) == ('s', 7.0)
     assert capsys.readouterr().err == ''
 
 

@@ -171,7 +171,7 @@ def test_a_mistake_in_the_detector_ends_neither_node_nor_answers(make_bench, mon
     [
         ('image_order:=sideways', 'image_order'),
         ("input_types:=['image=sensor_msgs/msg/LaserScan']", 'input_types: image must be one of'),
-        ('false_alarm:=0.0', 'false_alarm'),
+        ('sidelobe_db:=-1.0', 'sidelobe_db'),
     ],
 )
 def test_a_wrong_parameter_is_named(make_bench, argument, word):

@@ -146,7 +146,7 @@ def test_a_node_warns_of_the_share_that_it_lost(make_bench, walker):
     from sonar_imm.nodes.base import TrackerNode
     from sonar_imm.nodes.messages import message_class
 
-    bench = make_bench('-p', 'queue_depth:=5')
+    bench = make_bench('-p', 'qos_overrides./fix.subscription.depth:=5')
     node = bench.add(TrackerNode('walker', context=bench.context))
     given = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     kind = message_class('geometry_msgs/msg/PoseWithCovarianceStamped')

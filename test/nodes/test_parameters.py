@@ -44,7 +44,7 @@ def refusal(start, *parameters):
 def test_defaults_and_descriptors(start):
     node = start()
     assert node.get_parameter('sound_speed').value == 1500.0
-    assert node.get_parameter('queue_depth').value == 50
+    assert node.get_parameter('max_revisions').value == 100
     assert node.get_parameter('input_types').value == []
     made = node.describe_parameter('sound_speed')
     assert made.description == 'speed of sound [m/s]'
@@ -92,7 +92,7 @@ def test_an_empty_list_empties_a_list(start):
          "parameter 'mood' must be one of calm, hasty, got 'hastey' (did you mean 'hasty'?)"),
         ('steps:=[]', "parameter 'steps' is given without a value"),
         ('fast_share:=0.5', 'fast_share and slow_share must sum to 1'),
-        ('queue_depth:=0', "parameter 'queue_depth' must be between 1 and 100000, got 0"),
+        ('max_revisions:=-1', "parameter 'max_revisions' must be between 0 and 1e+06, got -1"),
     ],
 )  # fmt: skip
 def test_bad_start_values_are_explained(start, parameter, sentence):
@@ -101,7 +101,7 @@ def test_bad_start_values_are_explained(start, parameter, sentence):
 
 
 def test_all_mistakes_are_told_at_once(start):
-    assert len(refusal(start, 'sound_speed:=1500', 'steps:=2.5', 'queue_depth:=1.0')) == 3
+    assert len(refusal(start, 'sound_speed:=1500', 'steps:=2.5', 'max_revisions:=1.0')) == 3
 
 
 def test_what_a_sensor_has_of_its_own_is_declared_where_it_is_given(make_bench):

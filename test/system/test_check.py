@@ -142,9 +142,9 @@ def test_detections_kept_in_a_bag_give_the_same_tracks(bags, tmp_path, capsys):
     assert (first / 'estimate.csv').read_bytes() == (second / 'estimate.csv').read_bytes()
     assert len((first / 'estimate.csv').read_text().splitlines()) > 10
     capsys.readouterr()
-    assert main(['track', str(bag), str(tmp_path / 'none'), '--set', 'false_alarm=1e-15']) == 0
-    assert main(['track', str(bag), str(tmp_path / 'bad'), '--set', 'false_alrm=1e-9']) == 2
-    assert 'false_al' in capsys.readouterr().err
+    assert main(['track', str(bag), str(tmp_path / 'none'), '--set', 'sidelobe_db=0.0']) == 0
+    assert main(['track', str(bag), str(tmp_path / 'bad'), '--set', 'sidelob_db=1.0']) == 2
+    assert 'sidelob' in capsys.readouterr().err
 
 
 def test_a_start_that_was_recorded_counts_live_and_offline(tmp_path, capsys):

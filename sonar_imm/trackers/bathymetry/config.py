@@ -63,30 +63,29 @@ class BathymetryConfig(MountingParameters):
     # fmt: off
     # -- which models ----------------------------------------------------------------------------
     model_set: str = live('terrain', '',
-        'terrain models run side by side: terrain has models of its own for smooth and rough '
-        'floors, height_two_rw runs the particle filter of the paper; an array that looks down '
-        '(tilt_deg of 60 or more) runs angle_two_rw in place of terrain',
+        'terrain models run side by side; height_two_rw is the particle filter of the paper, and '
+        'an array with tilt_deg of 60 or more runs angle_two_rw in place of terrain',
         choices=MODEL_SETS)
     sigmas: tuple[float, ...] = live((), '',
         'process noise of each model over a range bin, in the order of model_set: m, but 1/m for '
-        'ncs; empty: values that suit most floors',
+        'ncs; empty: usual values',
         range=(0.0, 1000.0), kind='float[]')
     sigmas_deg: tuple[float, ...] = live((), 'deg',
-        'angle_two_rw: process noise of the first model over a range bin, then of the second at '
-        'the first and at the last bin, linear between; empty: 0.1, 0.1, 2', range=(0.0, 90.0),
+        'angle_two_rw: process noise over a range bin, of the first model, then of the second at '
+        'the first and the last bin; empty: 0.1, 0.1, 2', range=(0.0, 90.0),
         kind='float[]')
     sigma_reference_bin: float = constant(0.0, 'm',
         'range bin for which sigmas and sigmas_deg are stated: they grow with sqrt(bin / '
         'reference); 0: as stated, whatever the bin', range=(0.0, 100.0))
     rough_std: float = live(0.3, 'm',
         'floor is labelled smooth (told 0) only where roughness of this standard deviation would '
-        'be seen; smooth means less than that', range=(0.0, 1000.0))
+        'be seen', range=(0.0, 1000.0))
     transition_matrix: tuple[float, ...] = live((), '',
         'transition matrix over a range bin, row-major, row = from; empty: stay_probability',
         range=(0.0, 1.0), kind='float[]')
     stay_probability: float = live(0.0, '',
-        'probability of keeping the model over a range bin, used without transition_matrix; 0: '
-        '0.995', range=(0.0, 1.0))
+        'probability of keeping the model over a range bin, without transition_matrix; 0: 0.995',
+        range=(0.0, 1.0))
     initial_probabilities: tuple[float, ...] = live((), '',
         'model probabilities before the first bin; empty: uniform', range=(0.0, 1.0),
         kind='float[]')
@@ -103,27 +102,26 @@ class BathymetryConfig(MountingParameters):
         'has no slope; the paper has 0', range=(0.0, 100.0))
 
     angle_drift: bool = live(True, '',
-        'angle_two_rw: predict the floor at constant height, not at constant angle; near nadir '
-        'the angle turns by degrees from bin to bin')
+        'angle_two_rw: predict the floor at constant height, not at constant angle')
 
     # -- sonar -----------------------------------------------------------------------------------
     sonar_height: float = live(15.0, 'm',
-        'height of the sonar above the reference floor; with nav used only where the filter '
-        'starts, see also sonar_height_std', range=(0.01, 12000.0))
+        'height of the sonar above the reference floor; with nav only at the start',
+        range=(0.01, 12000.0))
     side: str = live('starboard', '', 'side the array looks to', choices=('port', 'starboard'))
     tilt_deg: float = live(30.0, 'deg',
         'direction the array looks to, below the horizon', range=(-90.0, 90.0))
     element_spacing_wavelengths: float = live(0.0, '',
-        'distance between staves in wavelengths; 0: as the snapshot says, else 0.5',
+        'distance between staves in wavelengths; 0: as the snapshot states, else 0.5',
         range=(0.0, 100.0))
     calibrate_array: bool = live(True, '',
-        'measure gain, phase and noise of the staves from the echoes of each ping, from four '
-        'staves on, not with multipath; dead and inverted staves are found, and named')
+        'measure gain, phase and noise of four or more staves from the echoes of each ping; not '
+        'with multipath')
     conjugate: bool = live(False, '',
         'true when the phase of an echo from below broadside falls from stave to stave')
     conjugate_auto: bool = live(True, '',
         'turn conjugate round where the first pings fit a floor far better so; tilt_deg of 15 to '
-        '60 only, at other tilts a floor cannot tell')
+        '60 only')
     sound_speed: float = live(1500.0, 'm/s',
         'speed of sound for snapshots that hold times and state no sound speed',
         range=(1300.0, 1700.0))
@@ -132,21 +130,20 @@ class BathymetryConfig(MountingParameters):
     likelihood: str = constant('laplace', '',
         'distribution of the samples of one bin', choices=LIKELIHOODS)
     noise_variance: float = live(0.0, '',
-        'noise power at a stave, for snapshots that do not state it; 0: estimated from the water '
-        'column, or blindly where there is none', range=(0.0, 1e30))
+        'noise power at a stave, for snapshots that state none; 0: from the water column, or '
+        'blindly where there is none', range=(0.0, 1e30))
     gate_false_alarm: float = live(USUAL_ALARM, '',
-        'probability that the test for a coherent echo takes noise for one, at most 0.5; bins '
-        'without an echo are bridged with the smoothest model; 1: no test, every bin is an echo',
+        'probability that noise passes the test for a coherent echo, at most 0.5; 1: no test, '
+        'every bin is an echo',
         range=(1e-9, 1.0))
     decorrelation: float = live(0.0, '',
-        'share of the power of an echo that differs from stave to stave, as from a diffuse floor '
-        'under a wide aperture; it acts as noise', range=(0.0, 0.95))
+        'share of the power of an echo that differs from stave to stave, as of a diffuse floor; '
+        'acts as noise', range=(0.0, 0.95))
     layover: str = live('gated', '',
-        'bins with echoes of two surfaces, as of a ledge, a box or a wall: gated (no soundings), '
-        'resolved (the height of both, from four staves on; fewer are gated), or ignored (as if '
-        'of one), as always with multipath', choices=LAYOVER)
+        'bins with echoes of two surfaces: gated (no soundings), resolved (both heights, four '
+        'staves or more; else gated) or ignored, as always with multipath', choices=LAYOVER)
     multipath: bool = live(False, '',
-        'expect echoes by way of the surface, modelled as noise from their directions')
+        'expect echoes by way of the surface, as noise from their directions')
     sonar_depth: float = live(3.0, 'm',
         'depth of the sonar below the surface, for multipath', range=(0.0, 12000.0))
     multipath_level_db: float = constant(0.0, 'dB',
@@ -167,28 +164,27 @@ class BathymetryConfig(MountingParameters):
         'distance that a grid of heights reaches to both sides of the start, at least 2 '
         'sonar_height_std; a grid of angles holds all that are possible', range=(0.1, 1000.0))
     smoothing: str = live('auto', '',
-        'use of the whole ping for each bin: none, modes (Kim: the model probabilities only) or '
-        'states (outward and inward, everything: terrain alone); auto: states for terrain, else '
-        'none', choices=('auto', 'none', 'modes', 'states'))
+        'use of the whole ping for each bin: none, modes (model probabilities only) or states '
+        '(terrain only); auto: states for terrain, else none',
+        choices=('auto', 'none', 'modes', 'states'))
     ping_coupling: float = live(0.0, '',
-        'strength with which the model labels of neighbouring pings influence each other; 0: not '
-        'at all, 0.15 to 0.35 suit most; needs smoothing; estimates come one ping late, heights '
-        'do not change', range=(0.0, 5.0))
+        'strength with which model labels of neighbouring pings influence each other, usually '
+        '0.15 to 0.35; 0: none. Needs smoothing; estimates come one ping late', range=(0.0, 5.0))
     seed: int = live(0, '', 'seed of the random number generator', range=(0, 2**63 - 1))
 
     # -- the ship --------------------------------------------------------------------------------
     navigation: str = live('auto', '',
-        'use of nav: auto (from its first message on; for a recording that has nav: required), '
-        'required (pings wait for nav), ignored (a level sonar at rest)', choices=NAVIGATION)
+        'use of nav: auto (from its first message on; required for a bag that has nav), required '
+        '(pings wait for nav) or ignored (a level sonar at rest)', choices=NAVIGATION)
     sonar_lever: tuple[float, ...] = live((0.0, 0.0, 0.0), 'm',
         'vector from the navigation reference to the array: x forward, y port, z up (vehicle FLU)',
         range=(-100.0, 100.0))
     sonar_mount_rpy_deg: tuple[float, ...] = live((0.0, 0.0, 0.0), 'deg',
-        'roll, pitch, yaw of the array in the vehicle (FLU: pitch positive nose down), in '
-        'addition to side and tilt_deg', range=(-180.0, 180.0))
+        'roll, pitch, yaw of the array in the vehicle (FLU: pitch positive nose down), besides '
+        'side and tilt_deg', range=(-180.0, 180.0))
     max_gap: float = live(1.0, 's',
-        'longest time between two poses of nav that is interpolated; pings in a longer gap are '
-        'skipped and counted', range=(0.01, 60.0))
+        'longest time between two poses of nav that is interpolated; pings in longer gaps are '
+        'skipped', range=(0.01, 60.0))
     max_extrapolation: float = constant(0.0, 's',
         'time by which the last bin of a ping may be newer than the newest pose of nav; later '
         'ones wait', range=(0.0, 10.0))
@@ -196,15 +192,15 @@ class BathymetryConfig(MountingParameters):
     # -- the water -------------------------------------------------------------------------------
     sound_speed_profile: tuple[float, ...] = live((), '',
         'depth in m and sound speed in m/s in turn, linear between and constant beyond; empty: '
-        'straight rays; needs navigation', range=(-100.0, 12000.0), kind='float[]')
+        'straight rays. Needs navigation', range=(-100.0, 12000.0), kind='float[]')
     water_level: float = live(0.0, 'm',
-        'z of the water surface in the world: depth in sound_speed_profile is water_level - z',
+        'z of the water surface in the world; depth in sound_speed_profile is water_level - z',
         range=(-12000.0, 12000.0))
 
     # -- how well it is known --------------------------------------------------------------------
     sonar_height_std: float = live(0.0, 'm',
-        'standard deviation of sonar_height; the filter then starts at the first return; 0: '
-        'sonar_height is exact', range=(0.0, 1000.0))
+        'standard deviation of sonar_height, where the filter starts at the first return; 0: '
+        'exact', range=(0.0, 1000.0))
     attitude_std_deg: float = live(0.05, 'deg',
         'standard deviation of roll and pitch in nav', range=(0.0, 45.0))
     heading_std_deg: float = live(0.1, 'deg',

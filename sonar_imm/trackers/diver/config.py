@@ -112,8 +112,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         'motion models run side by side; also a set that another package registers',
         choices=MODEL_SETS, group=MODELS)
     target: str = parameter('diver', '',
-        'kind of target (diver, rov, fish, boat or ship): sets speeds, accelerations and turns '
-        'of families wherever a parameter is at its default',
+        'kind of target (diver, rov, fish, boat or ship): speeds, accelerations and turns of '
+        'families wherever a parameter is at its default',
         choices=tuple(TARGETS))
     directions: int = parameter(16, '',
         'number of headings (heading_speed, families)', range=(4, 64))
@@ -143,12 +143,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         'families: rate of going from one family of models to the others', range=(0.0, 10.0))
     covariance_scales: tuple[float, ...] = parameter(
         (0.02, 0.15, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e5, 1e6), '',
-        'families: factors by which scaled filters multiply the covariances of all measurements; '
-        'the published covariance is that of filters from 1 on; with dimensions 3: one filter, '
-        'scale 1',
+        'families: factors by which scaled filters multiply all measurement covariances; those '
+        'from 1 on determine the published covariance. With dimensions 3: one filter, scale 1',
         range=(0.01, 1e6), kind='float[]')
     sensor_delays: tuple[float, ...] = parameter((0.25, 0.5, 1.0, 2.0, 4.0), 's',
-        'families: delays that the stamps of one of several sensors may have; empty: none',
+        'families: possible delays of the stamps of one of several sensors; empty: none',
         range=(1e-3, 3600.0), kind='float[]')
     adaptation: str = constant('counts', '',
         'correction of the transition matrix by the data: counts (Dirichlet) or fixed (none)',
@@ -160,8 +159,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
     speed_mean: float = parameter(0.75, 'm/s',
         'speed expected of a new track (heading_speed, families)', range=(0.0, 20.0))
     speed_std: float = parameter(0.4, 'm/s',
-        'standard deviation of the speed of a new track around speed_mean (heading_speed, '
-        'families)', range=(1e-3, 20.0))
+        'standard deviation of the speed of a new track (heading_speed, families)',
+        range=(1e-3, 20.0))
     velocity_std: float = constant(0.7, 'm/s',
         'families: standard deviation on each axis of the velocity of a new track, around zero; '
         '2 at a fix of a diver', range=(1e-3, 20.0))
@@ -177,8 +176,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
     hover_noise: float = constant(0.05, 'm',
         'random walk of the position over 1 s while stopped', range=(0.0, 10.0))
     acceleration_noise: tuple[float, ...] = parameter((), 'm/s^2',
-        'families: acceleration noise of lively_calm, lively_sharp and quiet over 1 s; '
-        'empty: values tuned for divers', range=(0.0, 100.0), kind='float[]')
+        'families: acceleration noise of lively_calm, lively_sharp and quiet over 1 s; empty: '
+        'that of the target', range=(0.0, 100.0), kind='float[]')
 
     # -- measurements ----------------------------------------------------------------------------
     fix_std: float = live(1.0, 'm',
@@ -195,34 +194,32 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
     target_z: float = live(0.0, 'm',
         'z of the diver that is assumed when arrival times are used', range=(-12000.0, 12000.0))
     scan_period: float = parameter(0.0, 's',
-        'time in which a sensor that rotates or polls looks at everyone once: fixes without a '
-        'name between two multiples of it are one scan, at the middle; 0: those of one stamp are '
-        'a scan, in which a diver without a fix was missed; -1: fixes are no scans, of '
-        'transponders polled in turn', range=(-1.0, 3600.0))
+        'time in which a sensor that rotates or polls looks at all targets once: fixes without a '
+        'name within it are one scan. 0: fixes of one stamp are a scan, -1: fixes are no scans '
+        '(transponders polled in turn)', range=(-1.0, 3600.0))
 
     # -- tracks ----------------------------------------------------------------------------------
     max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 20,
-        description='largest number of divers tracked at once; 1 means that a single diver is '
-        'known to be there')
+        description='largest number of targets tracked at once; 1: a single target is known to '
+        'be there')
 
     # -- outliers --------------------------------------------------------------------------------
     burst_rate: float = live(0.005, '',
-        'families: probability that a fix begins a burst, fixes that are all off by the same '
-        'vector (multipath, a sensor that is off), and that it is a single outlier; 0: neither',
+        'families: probability that a fix begins a burst (fixes off by the same vector, as of '
+        'multipath), and that it is a single outlier; 0: neither',
         range=(0.0, 0.3))
     burst_end: float = live(0.05, '',
         'probability that a burst ends at a fix', range=(1e-3, 0.5))
     burst_std: float = live(20.0, 'm',
-        'standard deviation on each axis of the vector by which the fixes of a burst are off',
+        'standard deviation on each axis of the vector of a burst',
         range=(0.1, 1e4))
     outlier_probability: float = live(0.02, '',
-        'probability that an arrival time is an outlier: late by a reflection, or of something '
-        'else', range=(1e-6, 0.5))
+        'probability that an arrival time is an outlier, as of a reflection', range=(1e-6, 0.5))
 
     # -- depth -----------------------------------------------------------------------------------
     dimensions: int = parameter(2, '',
-        'number of coordinates estimated: 2 (the diver is at target_z) or 3 (depth is a state, '
-        'from arrivals, and from fixes that state a variance of z)', range=(2, 3))
+        'number of coordinates: 2 (the target is at target_z) or 3 (depth is a state, from '
+        'arrivals and from fixes with a variance of z)', range=(2, 3))
     depth_min: float = parameter(0.0, 'm',
         'least depth of a diver, positive down (dimensions 3)', range=(-1e3, 1.1e4))
     depth_max: float = parameter(20.0, 'm',
@@ -234,19 +231,17 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
 
     # -- systematic errors of instruments --------------------------------------------------------
     receiver_position_std: float = parameter(0.0, 'm',
-        'standard deviation on each horizontal axis of the stated positions of receivers; a '
-        'receiver at the place of the transmitter has no such error. Where this, '
-        'receiver_clock_std and sound_speed_std are 0, 0.3 m, 0.1 ms and 2 m/s are part of the '
-        'covariance of tracks from arrivals alone; exact instruments: 1e-6', range=(0.0, 1e3))
+        'standard deviation on each horizontal axis of receiver positions. Where this, '
+        'receiver_clock_std and sound_speed_std are 0, tracks from arrivals alone assume 0.3 m, '
+        '0.1 ms and 2 m/s; exact: 1e-6', range=(0.0, 1e3))
     receiver_clock_std: float = parameter(0.0, 's',
-        "standard deviation of the error of a receiver's clock; 0: see receiver_position_std",
+        "standard deviation of a receiver's clock error; 0: see receiver_position_std",
         range=(0.0, 1.0))
     sound_speed_std: float = parameter(0.0, 'm/s',
         'standard deviation of sound_speed; 0: see receiver_position_std', range=(0.0, 100.0))
     bearing_bias_std_deg: float = parameter(0.0, 'deg',
-        'standard deviation of a lasting error of the bearings of a sensor (a heading or a mount '
-        'that is off): of relative fixes, of bearings of arrivals, and of fixes of sensors whose '
-        'place coverage_sector states', range=(0.0, 45.0))
+        'standard deviation of a constant bearing error of a sensor (heading or mount): relative '
+        'fixes, bearings of arrivals, fixes of sensors with coverage_sector', range=(0.0, 45.0))
     systematic_errors: str = constant('mixed', '',
         'treatment of errors of receivers, clocks, sound speed and bearings: consider (in the '
         'covariance, never estimated), estimate, mixed (clocks and sound speed estimated, the '
@@ -255,8 +250,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
 
     # -- errors of fixes that last ---------------------------------------------------------------
     fix_bias_std: float = parameter(0.0, 'm',
-        'standard deviation on each axis of a lasting error of the fixes, on top of their '
-        'covariance', range=(0.0, 1e4))
+        'standard deviation on each axis of slowly varying fix errors, added to the covariance; '
+        'for sources that filter their output, as USBL or GPS', range=(0.0, 1e4))
     fix_bias_time: float = constant(60.0, 's',
         'time over which the lasting error of the fixes (fix_bias_std) is correlated',
         range=(1e-2, 1e6))
@@ -264,12 +259,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
     # -- association -----------------------------------------------------------------------------
     clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.0,
         range=(0.0, 1e4),
-        description='number of false fixes expected in a scan, per square metre; 0: jipda '
-        'learns it, place by place, from the fixes that belong to no track; gnn takes 1e-6')
+        description='false fixes expected per square metre and scan; 0: learnt by jipda for each '
+        'place, 1e-6 with gnn')
     association: str = parameter('auto', '',
-        'pairing of fixes and tracks: gnn (the most likely pairing, tracks confirmed by hits), '
-        'jipda (all pairings weighed, tracks confirmed by existence) or auto (jipda with '
-        'model_set families, else gnn)',
+        'association of fixes: gnn (the most likely one, tracks confirmed by hits), jipda (all '
+        'weighted, tracks confirmed by existence) or auto (jipda with families, else gnn)',
         choices=('auto', *ASSOCIATIONS))
     gate_probability: float = inherited(
         DetectionParameters, 'gate_probability', 0.999, constant=True)
@@ -281,53 +275,51 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         'number of consecutive scans or pings without a hit that cover a confirmed target and so '
         'end its track', range=(1, 10000))
     birth_density: float = live(2e-7, '1/(m^2 s)',
-        'jipda: number of new divers expected per square metre and second',
+        'jipda: new targets expected per square metre and second',
         range=(1e-14, 1.0))
     survival_time: float = constant(500.0, 's',
         'jipda: time for which a diver is expected to stay', range=(1.0, 1e7))
 
     # -- what the sensor covers ------------------------------------------------------------------
     coverage_sector: tuple[float, ...] = live((), 'm, deg',
-        'six numbers: x and y of the sensor; direction of the middle of its sector, '
-        'counterclockwise from x, and width in degrees; least and greatest range. A diver is '
-        'detected with detection_probability inside, never outside; empty: everywhere',
+        'x, y of the sensor, direction of the middle of its sector (counterclockwise from x), '
+        'width, least and greatest range; detection_probability holds inside, 0 outside. Empty: '
+        'everywhere',
         kind='float[]')
     coverage_file: str = parameter('', '',
-        'CSV file in place of detection_probability: a grid with the columns x, y, probability, '
-        'or range, probability with the range from the place in coverage_sector, else the '
-        'origin; outside it is 0; empty: none')
+        'CSV in place of detection_probability: columns x, y, probability, or range, probability '
+        '(from the place in coverage_sector, else the origin); 0 outside. Empty: none')
 
     # -- names -----------------------------------------------------------------------------------
     tags: tuple[str, ...] = parameter((), '',
-        'names of tags or divers: what comes on <name>/fix or <name>/relative, or in a frame of '
-        'that name, belongs to this target and goes to its own track without association',
+        'names of targets: fixes on <name>/fix or <name>/relative, or in a frame of that name, '
+        'go to their own track without association',
         kind='str[]')
     repeat_time: float = parameter(5.0, 's',
-        'time within which the same values again are a repeated poll, which is left out and '
-        'counted, longer where a sensor holds its values; 0: use them', range=(0.0, 3600.0))
+        'time within which equal values are repeats, left out and counted (longer where a sensor '
+        'holds its values); 0: use them', range=(0.0, 3600.0))
 
     # -- sensors ---------------------------------------------------------------------------------
     sensors: tuple[str, ...] = parameter((), '',
-        'names of sensors, of which fix_std, detection_probability, clutter_density, '
-        'coverage_sector and coverage_file may be stated as <name>.fix_std and so on: they apply '
-        'to what comes on <name>/fix, <name>/fixes or <name>/relative, or in a frame of that name',
+        'names of sensors with their own <name>.fix_std, detection_probability, clutter_density, '
+        'coverage_sector and coverage_file: for what comes on <name>/fix, /fixes or /relative, '
+        'or in a frame of that name',
         kind='str[]')
     own: tuple[tuple[str, Any], ...] = ()
 
     # -- latitude and longitude ------------------------------------------------------------------
     origin: tuple[float, ...] = inherited(OriginParameters, 'origin', (0.0, 0.0, 0.0),
         description='latitude, longitude and height above the ellipsoid of the origin of the '
-        'frame of the tracks; with both latitude and longitude 0: the first position given in '
-        'latitude and longitude, at that height')
+        'tracks; both 0: the first position in latitude and longitude, at that height')
     frame_id: str = parameter('', '',
-        'frame that the input must be in, and the frame of positions given in latitude and '
-        'longitude; empty: the frame of the first message accepted, and map')
+        'frame of the input, and of positions given in latitude and longitude; empty: that of '
+        'the first message, and map')
 
     # -- relative to a transceiver ---------------------------------------------------------------
     vessel: str = parameter('moving', '',
-        'what carries the transceiver of relative fixes: moving (a vessel whose pose comes by '
-        'nav, or by nav_fix and heading) or fixed (it lies at the origin, x east, and '
-        'transceiver_lever says where the transceiver is)', choices=VESSELS)
+        'carrier of the transceiver of relative fixes: moving (pose from nav, or nav_fix and '
+        'heading) or fixed (at the origin, x east; transceiver_lever is its place)',
+        choices=VESSELS)
     transceiver_lever: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'm',
         'vector from the reference of nav, or the antenna of nav_fix, to the transceiver: x '
         'forward, y port, z up', range=(-1e4, 1e4))
@@ -337,15 +329,15 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         'roll, pitch, yaw of the transceiver on the vessel (forward, port, up: pitch positive '
         'nose down)', range=(-180.0, 180.0))
     relative_axes: str = parameter('flu', '',
-        'axes of relative fixes whose message does not say: flu (forward, port, up of the '
+        'axes of relative fixes whose message states none: flu (forward, port, up of the '
         'transceiver), frd (forward, starboard, down), enu or ned (of the world, by its own '
         'compass)', choices=RELATIVE_AXES)
     relative_range_std: float = live(0.5, 'm',
         'standard deviation of the range of a relative fix that comes without covariance',
         range=(1e-4, 1e4))
     relative_angle_std_deg: float = live(2.0, 'deg',
-        'standard deviation, across in each direction, of the direction of a relative fix that '
-        'comes without covariance', range=(1e-3, 45.0))
+        'standard deviation of the direction of a relative fix that comes without covariance',
+        range=(1e-3, 45.0))
     vessel_position_std: float = live(1.0, 'm',
         "standard deviation on each axis of the vessel's position where its message states none",
         range=(0.0, 1e4))
@@ -353,8 +345,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         "standard deviation of the vessel's heading where its message states none",
         range=(0.0, 45.0))
     magnetic_declination_deg: float = parameter(0.0, 'deg',
-        'angle from true to magnetic north, positive east, for headings (input heading) and '
-        'relative fixes levelled by a compass; 0: they are from true north', range=(-180.0, 180.0))
+        'angle from true to magnetic north, positive east, for headings and relative fixes '
+        'levelled by a compass', range=(-180.0, 180.0))
     vessel_attitude_std_deg: float = constant(0.5, 'deg',
         "standard deviation of the vessel's roll and pitch where its message states none",
         range=(0.0, 45.0))

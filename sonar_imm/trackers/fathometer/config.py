@@ -42,31 +42,29 @@ class FathometerConfig(StampParameters):
     sound_speed: float = parameter(1500.0, 'm/s',
         'speed of sound in the water', range=(1300.0, 1700.0))
     sound_speed_std: float = parameter(10.0, 'm/s',
-        'standard deviation of sound_speed, a part of the error of every reflector that grows '
-        'with its depth below the array; 0: the speed is exact', range=(0.0, 200.0))
+        'standard deviation of sound_speed, in the error of every depth below the array; 0: '
+        'exact', range=(0.0, 200.0))
     array_depth: float = parameter(0.0, 'm',
-        'depth of the deepest hydrophone, where neither the record nor a companion instrument '
-        'states it; 0: depths are counted from that hydrophone', range=(0.0, 12000.0))
+        'depth of the deepest hydrophone where no record or instrument states it; 0: depths are '
+        'counted from that hydrophone', range=(0.0, 12000.0))
     array_depth_age: float = constant(30.0, 's',
         'largest time between a record and the depth or position of a companion instrument that '
         'is used for it', range=(0.0, 86400.0))
     array_depth_std: float = live(0.03, 'm',
-        'standard deviation of the stated depth of the array, a part of the error of every '
-        'reflector; 0: depths are judged as seen from the array', range=(0.0, 1000.0))
+        'standard deviation of the stated depth of the array, in the error of every depth; 0: '
+        'depths as seen from the array', range=(0.0, 1000.0))
 
     heave: str = parameter('auto', '',
-        'whether the error of the stated depth of the array (array_depth_std) is a state that all '
-        'reflectors share: none; independent (a new error in each record); memory (correlated by '
-        'heave_memory); auto: none until the reflectors of an array move together by more than '
-        'twice of it, then independent with the error that was found', choices=HEAVES)
+        'error of the stated depth of the array as a state that all reflectors share: none, '
+        'independent (new in each record), memory (correlated), or auto (independent once they '
+        'move together by more than twice array_depth_std)', choices=HEAVES)
     heave_memory: float = constant(0.9, '',
         'heave memory: share of the error of the array depth that stays from record to record',
         range=(0.01, 0.99))
 
     # -- from pressure to cross-spectra -----------------------------------------------------------
     snapshot_seconds: float = parameter(0.0, 's',
-        'length of a snapshot; 0: what the depths to be tracked and the number of hydrophones '
-        'need, or for cross-spectra one over the spacing of their frequencies',
+        'length of a snapshot; 0: what depths and number of hydrophones need',
         range=(0.0, 1000.0))
     overlap: float = parameter(0.5, '',
         'share that successive snapshots have in common', range=(0.0, 0.95))
@@ -74,15 +72,15 @@ class FathometerConfig(StampParameters):
     record_seconds: float = parameter(89.6, 's',
         'length of pressure averaged for one record', range=(1e-3, 86400.0))
     preview_seconds: float = parameter(0.0, 's',
-        'time between previews, which are estimates from the sliding average that are not '
-        'committed; 0: none', range=(0.0, 86400.0))
+        'time between previews, estimates from the sliding average that are not committed; 0: '
+        'none', range=(0.0, 86400.0))
 
     # -- hydrophones that differ ------------------------------------------------------------------
     phone_correction: str = parameter('full', '',
-        'whether the cross-spectra are corrected for hydrophones that differ: off; gains; full '
-        '(turned and late ones, too, and those that hear something else are left out)',
+        'correction of hydrophones that differ: off, gains, or full (also inverted and late '
+        'ones; foreign ones are left out)',
         choices=PHONE_CORRECTIONS)
-    phone_least_share: float = parameter(0.1, '',
+    phone_least_share: float = constant(0.1, '',
         'phone_correction full: least share of the sound of its neighbours that a hydrophone '
         'has; with less it is left out', range=(0.0, 1.0))
 
@@ -102,114 +100,108 @@ class FathometerConfig(StampParameters):
         'processor white_noise: least white noise gain, relative to the largest possible',
         range=(-60.0, -0.01))
     frequency_min: float = parameter(50.0, 'Hz',
-        'lower edge of the frequency band that is used', range=(0.0, 1e6))
+        'lower edge of the frequency band', range=(0.0, 1e6))
     frequency_max: float = parameter(4000.0, 'Hz',
-        'upper edge of the frequency band that is used', range=(1.0, 1e6))
+        'upper edge of the frequency band', range=(1.0, 1e6))
     depth_min: float = parameter(0.0, 'm',
-        'least depth of a reflector; 0 together with depth_max: the whole trace, or 10 m to 110 m '
-        'below the array', range=(0.0, 12000.0))
+        'least depth of a reflector; 0 in both: the whole trace, or 10 to 110 m below the array',
+        range=(0.0, 12000.0))
     depth_max: float = parameter(0.0, 'm',
-        'greatest depth of a reflector; 0 together with depth_min: see there',
+        'greatest depth of a reflector',
         range=(0.0, 12000.0))
     depth_step: float = constant(0.0, 'm',
         'distance between the depths of the grid; 0: as the trace has it, or a sixth of the '
         'shortest half wavelength', range=(0.0, 100.0))
     noise_depth_min: float = live(180.0, 'm',
-        'upper end of the depths where noise is measured, down to noise_depth_max; the whole '
-        'trace when it does not reach there. 0 together with noise_depth_max, and where they lie '
-        'beyond half a snapshot: at the mirror image of the depths tracked, or in what '
-        'reflectors leave of a trace', range=(0.0, 12000.0))
+        'upper end of the depths where noise is measured; the whole trace if it does not reach '
+        'there. 0 in both: at the mirror image of the depths tracked, or in what reflectors '
+        'leave of a trace', range=(0.0, 12000.0))
     noise_depth_max: float = live(300.0, 'm',
-        'lower end of the depths where noise is measured, see noise_depth_min',
+        'lower end of the depths where noise is measured',
         range=(0.0, 12000.0))
     noise_sigma: float = live(0.0, '',
         'standard deviation of the noise of a trace; 0: as the trace says, else measured',
         range=(0.0, 1e30))
-    remove_background: bool = live(False, '',
+    remove_background: bool = constant(False, '',
         'for envelopes: subtract the median of the noise from the trace first')
 
     # -- pulse ------------------------------------------------------------------------------------
     pulse: str = parameter('auto', '',
-        'shape that one reflector leaves in the response: band (of a flat band), processor (what '
-        'mvdr makes of each record of an array; for other records as band), envelope (of the '
-        'envelope of a band), gaussian or file; auto: processor for an array with mvdr that is '
-        'longer than an eighth of the longest wave (frequency_min), else band, or for traces with '
-        'echoes of another width a Gaussian of the width they have', choices=PULSES)
+        'shape of one reflector in the response: band (of a flat band), processor (of mvdr, from '
+        'each record of an array), envelope (of a band), gaussian or file; auto: processor for '
+        'arrays longer than an eighth of the longest wave, else band, or gaussian where traces '
+        'have another width', choices=PULSES)
     pulse_width: float = parameter(0.5, 'm',
         'pulse gaussian: standard deviation of the pulse', range=(1e-4, 100.0))
     pulse_file: str = parameter('', '',
-        'pulse file: path of a CSV of two columns, distance in m from 0 on, and value')
+        'pulse file: CSV of distance in m from 0 on, and value')
 
     # -- envelopes --------------------------------------------------------------------------------
     water: str = parameter('auto', '',
-        'auto: traces that are never negative are envelopes, of which the noise by depth, the '
-        'transmit pulse, the water and the floor below it are found; off: their noise is taken '
-        'for Gaussian', choices=WATERS)
+        'auto: traces that are never negative are envelopes, whose noise, transmit pulse, water '
+        'and floor are found; off: Gaussian noise', choices=WATERS)
     blanking: float = parameter(0.0, 'm',
-        'envelopes: depth above which nothing is looked at, because of the transmit pulse; 0: '
-        'the transmit pulse is found',
+        'envelopes: depth down to which the transmit pulse is left out; 0: it is found',
         range=(0.0, 12000.0))
-    bottom_jump: float = parameter(0.005, '',
+    bottom_jump: float = constant(0.005, '',
         'envelopes: probability that the floor jumps anywhere from one record to the next',
         range=(1e-9, 0.5))
-    fish_rate: float = parameter(0.001, '1/m',
+    fish_rate: float = constant(0.001, '1/m',
         'envelopes: how often a run of loud samples, as of fish, begins in the water',
         range=(1e-9, 1.0))
 
     # -- sediment ---------------------------------------------------------------------------------
     sediment_sound_speed: float = live(0.0, 'm/s',
-        'speed of sound just below the bottom, for the column sediment_depth; 0: as in the water',
+        'speed of sound just below the bottom, for the column sediment_depth; 0: as in the '
+        'water',
         range=(0.0, 8000.0))
     sediment_sound_speed_std: float = live(0.0, 'm/s',
         'standard deviation of sediment_sound_speed', range=(0.0, 2000.0))
     sediment_sound_speed_gradient: float = live(0.0, '1/s',
-        'growth of the speed of sound in the sediment with the depth below the bottom',
+        'growth of the speed of sound with the depth below the bottom',
         range=(0.0, 10.0))
 
     # -- the set of reflectors --------------------------------------------------------------------
-    order_min: int = parameter(1, '', 'least number of reflectors that is possible', range=(0, 64))
+    order_min: int = parameter(1, '', 'least number of reflectors', range=(0, 64))
     order_max: int = parameter(12, '',
-        'greatest number of reflectors that is possible', range=(1, 64))
+        'greatest number of reflectors', range=(1, 64))
     order_switch_probability: float = parameter(0.05, '',
-        'probability that a record has one reflector more than the last, and as large a '
-        'probability of one less', range=(0.0, 0.5))
+        'probability of one reflector more than in the last record, and of one less',
+        range=(0.0, 0.5))
     order_transition_matrix: tuple[float, ...] = parameter((), '',
         'transition matrix of the number of reflectors, row-major, row = from; empty: '
         'order_switch_probability', range=(0.0, 1.0), kind='float[]')
     depth_std: float = parameter(0.1, 'm',
-        'standard deviation of the change of the depth of a reflector from record to record',
+        'standard deviation of the change of a depth from record to record',
         range=(1e-4, 100.0))
     slope_std: float = parameter(0.4, 'm',
-        'standard deviation of the slope of a reflector that dips, as the change of its depth '
-        'from record to record; 0: all are still. With heave there are no slopes',
+        'standard deviation of the slope of a dipping reflector, as change of depth per record; '
+        '0: all are still, as with heave',
         range=(0.0, 100.0))
     slope_switch_probability: float = constant(0.02, '',
         'slopes (slope_std): probability that from a record to the next a reflector begins to '
         'dip, ends it, or has a new slope', range=(1e-6, 0.3))
     record_interval: float = parameter(0.0, 's',
-        'time from record to record that depth_std, order_switch_probability and all else per '
-        'record are meant for; after a gap they count as often as records would have come; 0: '
-        'the median of the first intervals', range=(0.0, 86400.0))
+        'time between records that all values per record are meant for; 0: the median of the '
+        'first intervals', range=(0.0, 86400.0))
     record_distance: float = parameter(0.0, 'm',
-        'distance from record to record that they are meant for instead, where positions tell how '
-        'far apart two records are; 0: time counts', range=(0.0, 100_000.0))
+        'distance between records, in place of record_interval where positions are known; 0: '
+        'time counts', range=(0.0, 100_000.0))
     common_jump_probability: float = parameter(0.05, '',
-        'probability that from a record to the next all reflectors jump by the same distance, as '
-        'over a fault of the floor, or where the depth of the array or the window of a trace '
-        'changes unsaid; 0: they never do. With heave there are no jumps', range=(0.0, 0.5))
+        'probability that all reflectors jump by the same distance, as over a fault or where the '
+        'depth of the array changes unsaid; 0: never, as with heave', range=(0.0, 0.5))
     common_jump_std: float = parameter(1.5, 'm',
-        'standard deviation of such a jump, which is cut at 2.67 of it', range=(0.01, 100.0))
+        'standard deviation of a common jump, cut at 2.67 of it', range=(0.01, 100.0))
     min_separation: float = parameter(0.4, 'm',
         'least distance between two reflectors', range=(1e-4, 1000.0))
     polarity: str = parameter('auto', '',
-        'sign of the reflectors looked for: positive where the impedance grows with depth; '
-        'envelopes (remove_background) have no negative ones; auto: both for records of an array '
-        'with pulse processor, else positive', choices=POLARITIES)
+        'sign of reflectors: positive (impedance grows with depth) or both; auto: both for '
+        'arrays with pulse processor, else positive', choices=POLARITIES)
     negative_probability: float = constant(0.05, '',
         'polarity both: probability that a new reflector is negative', range=(1e-6, 0.999))
     amplitude_std_sigmas: float = parameter(7.5, '',
         'standard deviation of amplitudes, in units of the noise; a third of it with processor '
-        'conventional, whose echoes stand out by a third, unless amplitudes have a memory',
+        'conventional',
         range=(0.01, 1e6))
     amplitude_memory: float = constant(0.0, '',
         'share of its amplitude that a reflector keeps from record to record; 0: none',
@@ -219,16 +211,16 @@ class FathometerConfig(StampParameters):
     particles: int = parameter(20_000, '',
         'number of particles, each a set of reflectors', range=(2, 10_000_000))
     threads: int = parameter(1, '',
-        'number of processor cores used; the result does not depend on it', range=(1, 256))
+        'number of processor cores; the result does not depend on it', range=(1, 256))
     seed: int = parameter(0, '', 'seed of the random number generator', range=(0, 2**63 - 1))
     smoothing_lag: int = parameter(0, '',
-        'number of records after which an estimate is revised with what came since; 0: never',
+        'number of records after which an estimate is revised; 0: never',
         range=(0, 100))
 
     # -- output -----------------------------------------------------------------------------------
     existence_min: float = live(0.5, '',
-        'least probability of existence with which a reflector is reported', range=(0.0, 1.0))
-    detectable_sigmas: float = live(4.0, '',
+        'least probability of existence of a reported reflector', range=(0.0, 1.0))
+    detectable_sigmas: float = constant(4.0, '',
         'amplitude, in units of the noise, above which reflectors are surely held: the columns '
         'prob_detectable_k are of the number of those above it', range=(0.1, 1000.0))
     multiples: str = constant('mark', '',

@@ -56,19 +56,19 @@ class ObstacleConfig(
 
     # -- what an obstacle may do -----------------------------------------------------------------
     behaviours: tuple[str, ...] = parameter(BEHAVIOURS, '',
-        'behaviours of an obstacle that are considered: fixed, swaying (on its mooring), moving, '
-        'seabed (lying on the sea floor); seabed is left out while no altitude is known, and '
-        'needs another beside it; also behaviours that other packages register',
+        'behaviours considered: fixed, swaying (on a mooring), moving, seabed (on the sea floor; '
+        'needs an altitude, and another behaviour beside it), and those that other packages '
+        'register',
         choices=BEHAVIOURS, group=MODELS)
     sway_std: float = parameter(0.5, 'm',
-        'behaviour swaying: standard deviation of the position along each axis; twice as much is '
-        'considered too, at a tenth of the prior probability',
+        'behaviour swaying: standard deviation of the position along each axis; twice as much '
+        'with a tenth of the prior probability',
         range=(0.001, 100.0))
     sway_time: float = constant(20.0, 's',
         'behaviour swaying: time over which the position is correlated', range=(0.1, 3600.0))
     max_speed: float = parameter(1.5, 'm/s',
-        'behaviour moving: twice the standard deviation of the velocity along each axis before '
-        'anything is known of it', range=(0.01, 50.0))
+        'behaviour moving: twice the prior standard deviation of the velocity along each axis',
+        range=(0.01, 50.0))
     speed_noise: float = constant(0.05, 'm/s/sqrt(s)',
         'behaviour moving: random walk of the velocity; slow ones change less', range=(0.0, 10.0))
     behaviour_time: float = constant(1000.0, 's',
@@ -92,27 +92,27 @@ class ObstacleConfig(
         'roll, pitch, yaw of the sonar in the vehicle (FLU: pitch positive nose down)',
         range=(-180.0, 180.0))
     azimuth_model: str = parameter('plane', '',
-        'what a bearing is: the angle of the vertical plane of the echo (plane), or of the cone '
-        'that a linear array measures (cone)', choices=AZIMUTH_MODELS)
+        'bearing: angle of the vertical plane of the echo (plane), or of the cone that a linear '
+        'array measures (cone)', choices=AZIMUTH_MODELS)
     bearing_positive: str = parameter('port', '',
-        'side to which the bearings of detections count up, once they are read as their message '
-        'defines', choices=('port', 'starboard'))
+        'side to which bearings count up, once read as their message defines',
+        choices=('port', 'starboard'))
     beam_axes: str = parameter('auto', '',
-        'axes of the beam vectors of SonarRanges and sonar images: marine (z forward, y to '
-        'starboard, as their definition says), rep103 (x forward, y to port), or by which of the '
-        'two the beams point along', choices=BEAM_AXES)
+        'axes of the beam vectors of SonarRanges and images: marine (z forward, y to starboard), '
+        'rep103 (x forward, y to port), or the one along which they point (auto)',
+        choices=BEAM_AXES)
     nav_twist_frame: str = parameter('child', '',
-        'axes of the twist of nav: of the vehicle (child), as Odometry defines it, or of the '
-        'world', choices=('child', 'world'))
+        'axes of the twist of nav: vehicle (child, as Odometry defines it) or world',
+        choices=('child', 'world'))
     ping_timing: str = parameter('instant', '',
-        'pose to which an echo belongs: instant (the pose at its stamp) or two_way (bearing: the '
-        'pose when the echo arrived; range: the mean of both ways)',
+        'pose of an echo: instant (at its stamp) or two_way (bearing: when the echo arrived; '
+        'range: mean of both ways)',
         choices=('instant', 'two_way'))
     sound_speed: float = parameter(1500.0, 'm/s',
-        'speed of sound for ping_timing two_way, and for travel times that come without a sound '
-        'speed', range=(1300.0, 1700.0))
+        'speed of sound for ping_timing two_way, and for travel times without one',
+        range=(1300.0, 1700.0))
     depth_is_absolute: bool = parameter(True, '',
-        'z of nav is zero at the sea surface, so that no obstacle lies higher than z = 0')
+        'z of nav is zero at the sea surface: no obstacle lies above z = 0')
 
     # -- what the sonar measures -----------------------------------------------------------------
     range_std: float = live(0.15782, 'm',
@@ -120,33 +120,31 @@ class ObstacleConfig(
     bearing_std_deg: float = live(0.25534, 'deg',
         'standard deviation of a bearing that comes without variance', range=(1e-6, 45.0))
     elevation_std_deg: float = live(1.0, 'deg',
-        'standard deviation of an elevation that comes without variance; of sonars that measure '
-        'elevations only', range=(0.01, 45.0))
+        'standard deviation of an elevation that comes without variance', range=(0.01, 45.0))
     max_range: float = parameter(100.0, 'm', 'range to which the sonar sees', range=(1.0, 10000.0))
     horizontal_fov_deg: float = parameter(45.0, 'deg',
         'full width of the sector that the sonar sees', range=(1.0, 170.0))
     vertical_fov_deg: float = parameter(15.0, 'deg',
         'full height of the beam of the sonar', range=(0.5, 90.0))
     variance_scale_min: float = live(0.1, '',
-        'least factor by which the variances of detections may be too large; it is learnt from '
-        'the echoes of obstacles; 1 in both: as stated', range=(1e-3, 1.0))
+        'least factor of the variances of detections, learnt from echoes of obstacles; 1 in '
+        'both: as stated', range=(1e-3, 1.0))
     variance_scale_max: float = live(30.0, '',
-        'largest factor by which the variances of detections may be too small',
+        'largest factor of the variances of detections',
         range=(1.0, 1e4))
     gate_probability: float = inherited(
         DetectionParameters, 'gate_probability', 0.9995, constant=True)
     clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.0,
-        description='number of false detections expected in a ping, per metre of range and '
-        'radian of bearing; 0: learnt, where they are', unit='1/(m rad)', range=(0.0, 1e4))
+        description='false detections expected in a ping, per metre of range and radian of '
+        'bearing; 0: learnt for each place', unit='1/(m rad)', range=(0.0, 1e4))
     birth_rate: float = live(0.02, '1/s',
-        'number of new obstacles expected in the sector in a second', range=(1e-9, 1e3))
+        'new obstacles expected in the sector in a second', range=(1e-9, 1e3))
     detection_profile: tuple[float, ...] = live((), 'm, 1',
-        'pairs of a range and the share of detection_probability that is left there, ranges '
-        'rising; linear between them, constant beyond; empty: detection_probability counts at '
-        'every range', range=(0.0, 1e5), kind='float[]')
+        'pairs of a range and the share of detection_probability there, ranges rising, linear '
+        'between; empty: the same at every range', range=(0.0, 1e5), kind='float[]')
     misses: str = parameter('ignored', '',
-        'what pings without an echo say of the height of an obstacle: nothing (ignored), or that '
-        'it is less probable in the beam (evidence)', choices=MISSES)
+        'effect of pings without an echo on the height: none (ignored), or the obstacle is less '
+        'probable in the beam (evidence)', choices=MISSES)
     # -- what is believed of depth and navigation ------------------------------------------------
     max_offset: float = constant(0.0, 'm',
         'largest vertical offset of a new obstacle; 0: what beam, surface and altitude allow',
@@ -159,44 +157,43 @@ class ObstacleConfig(
         'standard deviation of the scale error of the horizontal distances of nav against sonar '
         'ranges', range=(0.0, 0.2))
     drift_std: float = parameter(0.02, 'm/s',
-        'standard deviation of the velocity by which nav drifts, on each axis; 0: it does not; of '
-        'a good inertial system 0.003', range=(0.0, 10.0))
+        'standard deviation of the drift velocity of nav on each axis; 0: none, 0.003 for a good '
+        'inertial system', range=(0.0, 10.0))
     yaw_error_std_deg: float = parameter(0.5, 'deg',
-        'standard deviation of the angle between heading of nav and sonar, beside '
-        'sonar_mount_rpy_deg; 0: none; of a good inertial system 0.1', range=(0.0, 45.0))
+        'standard deviation of the angle between heading of nav and sonar; 0: none, 0.1 for a '
+        'good inertial system', range=(0.0, 45.0))
     navigation_delay_std: float = parameter(0.15, 's',
-        'standard deviation of the time by which the poses of nav are late or early; 0: they are '
-        'not; of a good inertial system 0.01', range=(0.0, 10.0))
+        'standard deviation of the lateness of the poses of nav; 0: none, 0.01 for a good '
+        'inertial system', range=(0.0, 10.0))
     navigation_good_probability: float = live(0.5, '',
-        'probability that nav is as good as an inertial system, and not as doubtful as drift_std, '
-        'yaw_error_std_deg and navigation_delay_std say; what is published weighs both by what '
-        'the obstacles show; 0: it is in doubt', range=(0.0, 1.0))
+        'prior probability that nav is as good as an inertial system, not as drift_std, '
+        'yaw_error_std_deg and navigation_delay_std allow; 0: these hold', range=(0.0, 1.0))
     range_scale_std: float = live(0.001, '',
-        'standard deviation of the scale error of ranges, from the sound speed that the sonar '
-        'assumes; part of the covariance of range, offset and position', range=(0.0, 0.2))
+        'standard deviation of the scale error of ranges (sound speed that the sonar assumes), '
+        'part of every covariance', range=(0.0, 0.2))
     navigation_grade: str = parameter('ins', '',
-        'how fast the error of nav grows: ins (inertial system with a DVL: 0.08 m and 0.15 deg in '
-        'a minute), dvl (DVL and compass: 0.4 m, 0.4 deg) or dead_reckoning (speed through the '
-        'water and compass: 2.3 m, 0.8 deg)', choices=tuple(GRADES))
+        'growth of the error of nav in a minute: ins (inertial with DVL: 0.08 m, 0.15 deg), dvl '
+        '(DVL and compass: 0.4 m, 0.4 deg) or dead_reckoning (water speed and compass: 2.3 m, '
+        '0.8 deg)', choices=tuple(GRADES))
     navigation_noise: tuple[float, ...] = constant((), 'm/sqrt(s), deg/sqrt(s), m/sqrt(s)',
         'random walks of horizontal position, yaw and depth; empty: as of navigation_grade',
         range=(0.0, 10.0), kind='float[]')
 
     # -- avoidance -------------------------------------------------------------------------------
     safety_radius: float = live(3.0, 'm',
-        'collision: an obstacle passed nearer than this horizontally, and less than safety_height '
-        'above or below', range=(0.01, 1000.0))
+        'collision: an obstacle passed nearer than this horizontally and within safety_height '
+        'vertically', range=(0.01, 1000.0))
     safety_height: float = live(2.0, 'm',
-        'collision: an obstacle passed less than this above or below, and nearer than '
-        'safety_radius horizontally', range=(0.01, 1000.0))
+        'collision: an obstacle passed less than this above or below and within safety_radius',
+        range=(0.01, 1000.0))
     cpa_horizon: float = live(120.0, 's',
         'time ahead for which collisions are predicted', range=(1.0, 3600.0))
     course_window: float = constant(10.0, 's',
         'length of the latest positions of the vehicle from which its course is estimated',
         range=(1.0, 600.0))
     course_std: float = live(0.035, 'm/s',
-        'standard deviation of the velocity of the vehicle along its course, on each axis; a '
-        'sway of 0.14 m within 20 s leaves 0.034 in 10 s', range=(0.0, 5.0))
+        'standard deviation of the velocity of the vehicle along its course, on each axis; 0.034 '
+        'for a sway of 0.14 m within 20 s', range=(0.0, 5.0))
 
     # -- tracks ----------------------------------------------------------------------------------
     max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 40)
@@ -204,13 +201,13 @@ class ObstacleConfig(
         description='expected number of hits that confirm a track, together with '
         'confirm_existence')
     confirm_existence: float = live(0.95, '',
-        'probability to be an obstacle from which a track is confirmed, together with '
-        'confirm_hits', range=(0.5, 0.9999))
+        'probability of being an obstacle that confirms a track, together with confirm_hits',
+        range=(0.5, 0.9999))
 
     # -- memory ----------------------------------------------------------------------------------
     max_landmarks: int = live(200, '',
-        'largest number of obstacles remembered after they left the field of view; 0: none; the '
-        'oldest and least certain go first',
+        'largest number of obstacles remembered out of view, the oldest and least certain going '
+        'first; 0: none',
         range=(0, 10000))
     landmark_time: float = constant(86400.0, 's',
         'mean time for which an obstacle that nobody sees stays where it was',
@@ -221,8 +218,8 @@ class ObstacleConfig(
         'longest time between two poses of nav that is interpolated; pings in longer gaps are '
         'skipped', range=(0.001, 3600.0))
     max_extrapolation: float = parameter(0.0, 's',
-        'time by which a ping may be newer than the newest pose of nav and still be used at once; '
-        '0: it waits for the next pose', range=(0.0, 10.0))
+        'time by which a ping may be newer than the newest pose and still be used at once; 0: it '
+        'waits', range=(0.0, 10.0))
     history: float = inherited(StreamParameters, 'history', 5.0)
     max_gap: float = inherited(StreamParameters, 'max_gap', 600.0)
     # fmt: on

@@ -30,7 +30,7 @@ from ...measurements import (
     SonarImage,
     SonarInfo,
 )
-from ...parameters import Config, ConfigError, parameter
+from ...parameters import Config, ConfigError, constant, parameter
 
 SIDES = ('port', 'starboard')
 ENDS = ('near', 'far')
@@ -48,71 +48,67 @@ class DetectorConfig(Config):
     # fmt: off
     # -- how images are written ------------------------------------------------------------------
     image_order: str = parameter('range_major', '',
-        'order of the samples of an image: all beams of a range together (range_major), or all '
-        'ranges of a beam (beam_major)', choices=IMAGE_ORDERS)
+        'order of the samples: all beams of a range together (range_major), or all ranges of a '
+        'beam (beam_major)', choices=IMAGE_ORDERS)
     image_scale: str = parameter('amplitude', '',
-        'what a sample of an image is: an amplitude, a power, or a level in steps of decibel_step '
-        '(decibel)', choices=SCALES)
+        'what a sample is: an amplitude, a power, or a level in steps of decibel_step (decibel)',
+        choices=SCALES)
     decibel_step: float = parameter(0.5, 'dB',
         'image_scale decibel: level of one count', range=(1e-3, 100.0))
     beam_axes: str = parameter('auto', '',
         'axes of the beam vectors: marine (z forward, y to starboard), rep103 (x forward, y to '
-        'port), or by which of the two the beams point along', choices=BEAM_AXES)
+        'port), or the one along which they point (auto)', choices=BEAM_AXES)
     sound_speed: float = parameter(1500.0, 'm/s',
         'speed of sound for raw images that state none', range=(1300.0, 1700.0))
     image_near_range: float = parameter(0.0, 'm',
-        'nearest range of images that do not state it (sensor_msgs/Image, SonoptixECHO)',
+        'nearest range of images that state none (sensor_msgs/Image, SonoptixECHO)',
         range=(0.0, 1e4))
     image_far_range: float = parameter(0.0, 'm',
-        'farthest range of images that do not state it (sensor_msgs/Image, SonoptixECHO); 0: '
-        'unknown', range=(0.0, 1e4))
+        'farthest range of images that state none; 0: unknown', range=(0.0, 1e4))
     image_fov_deg: float = parameter(0.0, 'deg',
-        'width of the sector of images that do not state it (sensor_msgs/Image, SonoptixECHO); 0: '
-        'unknown', range=(0.0, 360.0))
+        'width of the sector of images that state no bearings; 0: unknown', range=(0.0, 360.0))
     image_first_beam: str = parameter('port', '',
-        'side on which the first column lies of images that do not state bearings '
-        '(sensor_msgs/Image, SonoptixECHO)', choices=SIDES)
+        'side of the first column of images that state no bearings', choices=SIDES)
     image_first_range: str = parameter('near', '',
-        'end at which the first row lies of images that do not state ranges (sensor_msgs/Image, '
-        'SonoptixECHO)', choices=ENDS)
+        'end of the first row of images that state no ranges', choices=ENDS)
 
     # -- how echoes are found --------------------------------------------------------------------
     beam_width_deg: float = parameter(1.0, 'deg',
         '-3 dB width of a beam; no less than a column', range=(0.01, 90.0))
     range_resolution: float = parameter(0.3, 'm',
         '-3 dB width of the echo of a point; no less than a row', range=(1e-3, 100.0))
-    training: int = parameter(16, '',
+    training: int = constant(16, '',
         'number of rows before and behind an echo from which the noise is estimated',
         range=(2, 1000))
-    training_beams: int = parameter(25, '',
+    training_beams: int = constant(25, '',
         'number of columns around an echo from which the noise is estimated', range=(1, 1000))
-    guard: int = parameter(4, '',
+    guard: int = constant(4, '',
         'number of rows around an echo that are left out of the estimate of the noise',
         range=(0, 100))
-    false_alarm: float = parameter(1e-6, '',
+    false_alarm: float = constant(1e-6, '',
         'probability that a cell of Rayleigh noise is taken for an echo', range=(1e-15, 0.1))
     threshold_margin_db: float = parameter(0.5, 'dB',
-        'margin added to the detection threshold, beyond what the roughness of the sea floor asks '
-        'for', range=(0.0, 30.0))
-    growth_false_alarm: float = parameter(1e-3, '',
+        'margin of the detection threshold above that of the noise and the roughness of the sea '
+        'floor; -3: one of a thousand noise cells passes, not one of a million',
+        range=(-3.0, 30.0))
+    growth_false_alarm: float = constant(1e-3, '',
         'probability that a cell of Rayleigh noise beside an echo is taken for a part of the echo',
         range=(1e-15, 0.5))
     sidelobe_db: float = parameter(17.0, 'dB',
-        'level below the loudest cell of a range under which cells are taken for its sidelobes',
+        'cells so far below the loudest one of their range are taken for its sidelobes',
         range=(0.0, 200.0))
     join_distance: float = parameter(1.5, 'm',
         'distance below which echoes are joined to one obstacle', range=(0.0, 100.0))
     min_range: float = parameter(1.0, 'm',
-        'range below which echoes are taken for the vehicle; none are found either in the first '
-        'rows of an image, half of training and guard', range=(0.0, 1e4))
+        'range below which echoes are taken for the vehicle; the first 10 rows of an image give '
+        'none either', range=(0.0, 1e4))
     max_detections: int = parameter(100, '',
         'largest number of detections of a ping, the strongest', range=(1, 10_000))
 
     # -- a scanning sonar ------------------------------------------------------------------------
     sweep_sector_deg: float = parameter(120.0, 'deg',
-        'scanning sonar: full width of the sector around ahead whose directions are used, the '
-        'others are not', range=(1.0, 360.0))
-    sweep_max_gap: float = parameter(2.0, 's',
+        'scanning sonar: full width of the sector around ahead that is used', range=(1.0, 360.0))
+    sweep_max_gap: float = constant(2.0, 's',
         'scanning sonar: time without a beam that ends a sweep', range=(0.01, 600.0))
     # fmt: on
 

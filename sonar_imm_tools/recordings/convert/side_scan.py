@@ -124,7 +124,7 @@ class _Seen:
         if self.images and not self.echoes:
             report.questions.append(
                 f'{path.name}: no echo was found in {self.images} pings of {self.how.side}; is '
-                'the other --side meant, or another threshold (--set false_alarm=0.001)?'
+                'the other --side meant, or another threshold (--set threshold_margin_db=-3.0)?'
             )
         if self.pings and not self.headings and '/nav' in report.messages:
             report.questions.append(

@@ -30,6 +30,7 @@ pytestmark = pytest.mark.system
 FLOOD = (50, 0.01)
 """Messages, and each so many seconds: more at once are lost on their way, not in the queue."""
 AGE = 'age of estimates p50 [s]'
+DEPTH = 'qos_overrides./fix.subscription.depth:={}'
 
 
 class Live:
@@ -89,7 +90,7 @@ class Live:
 
 def test_estimates_of_a_flooded_diver_node_stay_live_and_losses_are_said():
     with Rig(
-        CASES['diver'], ('-p', 'max_wait:=0.3', '-p', 'queue_depth:=5000'), lossless=False
+        CASES['diver'], ('-p', 'max_wait:=0.3', '-p', DEPTH.format(5000)), lossless=False
     ) as rig:
         live = Live(rig)
         live.until_said('faster than it can be processed: .* messages dropped', *FLOOD)
@@ -104,7 +105,7 @@ def test_estimates_of_a_flooded_diver_node_stay_live_and_losses_are_said():
 
 
 def test_a_flooded_diver_node_that_drops_nothing_says_how_old_its_estimates_are():
-    words = ('max_wait:=0.0', 'max_age:=0.2', 'queue_depth:=2000')
+    words = ('max_wait:=0.0', 'max_age:=0.2', DEPTH.format(2000))
     arguments = [word for each in words for word in ('-p', each)]
     with Rig(CASES['diver'], arguments, lossless=False) as rig:
         sentence = r'estimates are [\d.]+ s old: input comes faster than it can be processed'
