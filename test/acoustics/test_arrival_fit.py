@@ -18,13 +18,10 @@ from sonar_imm.acoustics.arrival_fit import ArrivalFit, minimise
 Z = -6.0
 RX = np.array(
     [
-        [80.0, 5.0, -2.0],
-        [-30.0, 70.0, -3.0],
-        [60.0, 90.0, -1.0],
-        [-70.0, -20.0, -4.0],
+        [80.0, 5.0, -2.0], [-30.0, 70.0, -3.0], [60.0, 90.0, -1.0], [-70.0, -20.0, -4.0],
         [10.0, -60.0, -2.0],
     ]
-)
+)  # fmt: skip
 TRUTH = np.array([22.0, 31.0])
 
 
@@ -36,15 +33,10 @@ def problem(active, offset=0.0, bearings=2):
     )
     seen = multistatic.bearing(TRUTH, RX[:bearings])
     return ArrivalFit(
-        tx=tx,
-        rx=RX,
-        active=active,
-        bearing_rx=RX[:bearings],
-        observed=np.concatenate([path, seen]),
-        weight=np.linspace(1.0, 3.0, len(RX) + bearings),
-        target_z=Z,
-        max_range=1000.0,
-    )
+        tx=tx, rx=RX, active=active, bearing_rx=RX[:bearings],
+        observed=np.concatenate([path, seen]), weight=np.linspace(1.0, 3.0, len(RX) + bearings),
+        target_z=Z, max_range=1000.0,
+    )  # fmt: skip
 
 
 KINDS = {'active': [True] * 5, 'passive': [False] * 5, 'mixed': [True, False, True, False, False]}
@@ -112,15 +104,10 @@ def test_tag_search_is_never_worse_than_one_begun_at_the_truth(seed):
     truth = rng.uniform(-150, 150, 2)
     noise = sigma * np.random.default_rng(seed).standard_normal(n)
     fit = ArrivalFit(
-        tx=rx,
-        rx=rx,
-        active=np.zeros(n, bool),
-        bearing_rx=np.empty((0, 3)),
-        observed=multistatic.slant_range(truth, rx, -5.0)[0] + noise,
-        weight=np.full(n, 0.15**-2),
-        target_z=-5.0,
-        max_range=1e4,
-    )
+        tx=rx, rx=rx, active=np.zeros(n, bool), bearing_rx=np.empty((0, 3)),
+        observed=multistatic.slant_range(truth, rx, -5.0)[0] + noise, weight=np.full(n, 0.15**-2),
+        target_z=-5.0, max_range=1e4,
+    )  # fmt: skip
     found = minimise(fit, fit.starts(fit.weight), fit.weight).distinct()
     begun = minimise(fit, truth[None], fit.weight)
     assert found.cost[0] <= 1.001 * begun.cost[0] + 1e-3

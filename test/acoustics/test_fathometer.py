@@ -130,8 +130,7 @@ def test_the_pulse_peaks_upright_at_the_layer(band, processor):
 
 
 def test_the_echo_keeps_its_sign_as_the_loading_grows(band):
-    """Loaded throughout it is upright to a loading of 3; an unloaded matrix in the middle turns it
-    over."""
+    """Upright to a loading of 3; an unloaded matrix in the middle turns it over."""
     frequency, R = band
     w = steering(frequency, HEIGHTS, C)
     for loading in (1e-3, 1e-2, 0.1, 1.0, 3.0):

@@ -45,16 +45,9 @@ def test_the_compiled_likelihood_is_that_of_linear_algebra(scene, likelihood):
     out = np.empty(len(u))
     for n in range(3):
         grid_kernels.log_likelihoods(
-            u,
-            SPACING,
-            -signal * form.beam[n],
-            form.base[n],
-            form.spread[n],
-            signal,
-            laplace.likelihood_table(STAVES, likelihood),
-            np.empty((4, len(u))),
-            out,
-        )
+            u, SPACING, -signal * form.beam[n], form.base[n], form.spread[n], signal,
+            laplace.likelihood_table(STAVES, likelihood), np.empty((4, len(u))), out,
+        )  # fmt: skip
         expected = interfered_log_likelihood(u, y[n], signal, covariance[n], STEP, likelihood)
         assert out[-1] == expected[-1] == -np.inf
         assert np.allclose(out[:-1], expected[:-1], rtol=3e-7, atol=1e-6)
@@ -69,19 +62,3 @@ def test_without_interferers_it_is_the_plain_law(scene):
     plain = log_likelihood(u, y[0], 7.0, NOISE[0], STEP)
     other = interfered_log_likelihood(u, y[0], 7.0, covariance[0], STEP)
     assert np.ptp(plain - other) < 1e-9
-
-
-def test_an_interferer_no_longer_draws_the_likelihood():
-    # An echo from 0.2 beside a surface echo from -0.6, three times as strong.
-    rng = np.random.default_rng(1)
-    grid, found, drawn = np.linspace(-0.95, 0.95, 191), [], []
-    covariance = interference.noise_covariance([[-0.6]], [[900.0]], np.ones(1), STAVES, STEP)[0]
-    for _ in range(50):
-        s = 10.0 * np.exp(2j * np.pi * rng.uniform(size=2)) * [1.0, 3.0]
-        y = s[0] * array.steering(0.2, 8, 0.5) + s[1] * array.steering(-0.6, 8, 0.5)
-        y += (rng.normal(size=8) + 1j * rng.normal(size=8)) / np.sqrt(2.0)
-        likelihood = interfered_log_likelihood(grid, y, 100.0, covariance, STEP)
-        found.append(grid[likelihood.argmax()])
-        drawn.append(grid[log_likelihood(grid, y, 100.0, 1.0, STEP).argmax()])
-    assert np.abs(np.array(found) - 0.2).max() < 0.06
-    assert np.abs(np.median(drawn) + 0.6) < 0.06

@@ -30,16 +30,10 @@ SOUND_SPEED, Z, SIGMA = 1500.0, -5.0, 1e-4
 TX = np.array([5.0, -10.0, -2.0])
 RX = np.array(
     [
-        [100.0, 10.0, -2.0],
-        [-20.0, 90.0, -3.0],
-        [70.0, 95.0, -1.0],
-        [-60.0, 20.0, -3.0],
-        [20.0, -70.0, -2.0],
-        [110.0, 60.0, -4.0],
-        [-70.0, 80.0, -1.0],
-        [40.0, 40.0, -2.0],
+        [100.0, 10.0, -2.0], [-20.0, 90.0, -3.0], [70.0, 95.0, -1.0], [-60.0, 20.0, -3.0],
+        [20.0, -70.0, -2.0], [110.0, 60.0, -4.0], [-70.0, 80.0, -1.0], [40.0, 40.0, -2.0],
     ]
-)
+)  # fmt: skip
 TRUTH = np.array([31.0, 42.0])
 
 
@@ -85,14 +79,10 @@ def test_errors_are_what_the_covariance_and_the_bound_say(kind):
         fixes.append(fix)
         gaps.append(fix.position - TRUTH)
     bound = crlb(
-        TRUTH,
-        None if kind == 'passive' else np.tile(TX, (n, 1)),
-        RX[:n],
-        np.full(n, SIGMA**2),
-        target_z=Z,
-        sound_speed=SOUND_SPEED,
+        TRUTH, None if kind == 'passive' else np.tile(TX, (n, 1)), RX[:n], np.full(n, SIGMA**2),
+        target_z=Z, sound_speed=SOUND_SPEED,
         var_bearing=sigma_bearing**2 if kind == 'bearings' else None,
-    )
+    )  # fmt: skip
     low, high = chi2.ppf([0.025, 0.975], 2 * runs) / runs
     assert low < np.mean([distance2(fix, TRUTH) for fix in fixes]) < high
     assert low < np.mean([gap @ np.linalg.solve(bound, gap) for gap in gaps]) < high

@@ -41,14 +41,11 @@ def results():
     places = np.column_stack([receivers[:, 1:3], -receivers[:, 3]])
     return [
         localise(
-            places[rows[:, 1].astype(int)],
-            rows[:, 2],
-            np.full(len(rows), SIGMA_TOA**2),
-            target_z=TAG_Z,
-            sound_speed=SOUND_SPEED,
+            places[rows[:, 1].astype(int)], rows[:, 2], np.full(len(rows), SIGMA_TOA**2),
+            target_z=TAG_Z, sound_speed=SOUND_SPEED,
         )
         for rows in (arrivals[arrivals[:, 0] == ping] for ping in np.unique(arrivals[:, 0]))
-    ]
+    ]  # fmt: skip
 
 
 @pytest.fixture(scope='module')

@@ -65,15 +65,9 @@ def draws(count, rng, *, levelled=False, angle_std=STD['angle_std'], covariance=
         # The lever is off too: what is measured lies beside where it is said to be.
         slip = VESSEL.R @ (MOUNT.lever_std * rng.normal(size=3))
         placed = place(
-            Pose(position + slip, turn @ VESSEL.R),
-            Uncertainty(POSITION, ATTITUDE),
-            mount,
-            offset,
-            covariance,
-            range_std=0.1,
-            angle_std=angle_std,
-            levelled=levelled,
-        )
+            Pose(position + slip, turn @ VESSEL.R), Uncertainty(POSITION, ATTITUDE), mount, offset,
+            covariance, range_std=0.1, angle_std=angle_std, levelled=levelled,
+        )  # fmt: skip
         found.append(placed.position)
         stated.append(placed.covariance)
     return np.array(found), np.array(stated)

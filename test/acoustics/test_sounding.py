@@ -19,12 +19,9 @@ def rows():
     table = load_vectors('bathymetry_sea/pose_table')
     s_att, s_head, *rest = table.pop('tpu')
     budget = ErrorBudget(
-        attitude=np.radians(s_att),
-        heading=np.radians(s_head),
-        heave=rest[0],
-        position=rest[1],
+        attitude=np.radians(s_att), heading=np.radians(s_head), heave=rest[0], position=rest[1],
         sound_speed=rest[2],
-    )
+    )  # fmt: skip
     speed = float(table.pop('sound_speed'))
     for k in range(len(table['p'])):
         yield {name: values[k] for name, values in table.items()}, budget, speed

@@ -134,8 +134,7 @@ def test_a_water_column_of_fading_noise_is_kept_whole(staves):
 
 @pytest.mark.parametrize('apart, differ', [(5, True), (6, False)])
 def test_a_bin_is_compared_with_the_five_on_either_side_of_it(apart, differ):
-    """One bin by itself agrees with itself, whatever its staves say; two of other directions do
-    not agree."""
+    """One bin by itself agrees with itself; two of other directions do not agree."""
     chosen = np.zeros(30, bool)
     chosen[[10, 10 + apart]] = True
     iq = np.ones((30, 4), complex)

@@ -54,8 +54,7 @@ def test_counts_at_a_constant_step_are_the_dirichlet_posterior_mean():
 
 
 def test_counting_a_chain_that_is_seen_recovers_it_at_any_step():
-    """Known models and irregular steps: the corrected matrix of the reference step approaches the
-    true one though not one transition was seen over that step."""
+    """Known models and irregular steps, none of them the reference step."""
     rng = np.random.default_rng(2)
     truth = markov.RateChain([[0.6, 0.3, 0.1], [0.1, 0.8, 0.1], [0.05, 0.35, 0.6]], 1.0)
     chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), weight=2.0)

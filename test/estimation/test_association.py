@@ -18,7 +18,6 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
-from sonar_imm.estimation import imm
 from sonar_imm.estimation.association import (
     assign,
     assign_by_rank,
@@ -32,11 +31,6 @@ from sonar_imm.estimation.association import (
 )
 
 RULES = TrackRules(confirm_hits=3, confirm_window=5, delete_misses=2, max_coast_ns=100)
-
-
-def covariances(rng, count, n=2):
-    root = rng.normal(size=(count, n, n + 1))
-    return root @ np.swapaxes(root, 1, 2)
 
 
 @pytest.mark.parametrize('dimension', [1, 2, 3])
@@ -152,19 +146,6 @@ def test_association_cost_is_the_log_of_the_ratio_of_the_two_explanations():
     )
 
 
-def test_nearest_in_all_beats_nearest_for_each():
-    """Two targets, the left detection near both: greedy leaves one target without, global does
-    not."""
-    predicted, detections = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[0.9, 0.0], [2.0, 0.0]])
-    P, R = np.tile(np.eye(2), (2, 1, 1, 1)), np.tile(0.1 * np.eye(2), (2, 1, 1))
-    fit = imm.gate(
-        predicted[:, None], np.eye(2)[None, None], P, np.ones((2, 1)), detections, R, 9.0
-    )
-    target, detection = imm.pairs_inside(fit)
-    cost = association_cost(fit[target, detection], 0.9, 1e-6)
-    assert list(assign(target, detection, cost, 2, 2)) == [0, 1]
-
-
 # -- life of tracks -------------------------------------------------------------------------------
 
 
@@ -178,21 +159,6 @@ def live(pattern, rules=RULES, dt=1):
             return [*statuses, None]
         statuses.append(int(tracks.status[0]))
     return statuses
-
-
-@pytest.mark.parametrize(
-    'pattern, expected',
-    [
-        ('111', [0, 0, 1]),
-        ('10101', [0, 0, 0, 0, 1]),
-        ('1000', [0, 0, 0, None]),
-        ('101001', [0, 0, 0, 0, None]),
-        ('111011', [0, 0, 1, 2, 1, 1]),
-        ('11100', [0, 0, 1, 2, None]),
-    ],
-)
-def test_life_of_a_track(pattern, expected):
-    assert live(pattern) == expected
 
 
 @given(
@@ -213,10 +179,6 @@ def test_life_equals_the_definition(hits, m, n, delete):
             break
         expected.append((1 if pattern[k - 1] == '1' else 2) if confirmed else 0)
     assert live(pattern, rules) == expected
-
-
-def test_one_hit_can_be_enough():
-    assert live('1', TrackRules(1, 1, 3, 100)) == [TrackStatus.CONFIRMED]
 
 
 def test_time_ends_a_track_too():
@@ -266,18 +228,6 @@ def test_rules_may_change_while_tracks_live(window):
 def test_rules_refuse_nonsense(arguments):
     with pytest.raises(ValueError, match='track rules need'):
         TrackRules(*arguments)
-
-
-@pytest.mark.parametrize(
-    'rules', [(0, 3, 4, 5), (4, 3, 4, 5), (2, 3, 0, 5), (2, 3, 4, -1), (0, 0, 1, 0)]
-)
-def test_rules_by_which_no_track_could_live_are_refused(rules):
-    with pytest.raises(ValueError, match='track rules need'):
-        TrackRules(*rules)
-
-
-def test_the_strictest_rules_are_allowed():
-    assert TrackRules(1, 1, 1, 0).delete_misses == 1
 
 
 def test_identities_after_the_last_of_32_bits_are_those_that_no_track_has():

@@ -9,32 +9,25 @@
 """The bank of models and the table of rows against an independent prototype, the readable IMM and
 Monte Carlo."""
 
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from sonar_imm.estimation import bank as verbs
-from sonar_imm.estimation.bank import Bank, Gaussians, Moves
-from sonar_imm.estimation.rows import Rows
+from sonar_imm.estimation.bank import Bank, Gaussians
 
 FOLDER = Path(__file__).parents[1] / 'vectors' / 'regret_free'
 MIXING = np.load(FOLDER / 'mixing.npz', allow_pickle=False)
-RUN = np.load(FOLDER / 'run.npz', allow_pickle=False)
 ORDER = np.argsort(MIXING['kind'] == 1, kind='stable')
 """Velocities come last in a bank."""
 A = int((MIXING['kind'] != 1).sum())
 HOVER = MIXING['kind'][ORDER][:A] == 2
 UNITS = np.where(HOVER, 0.0, MIXING['heading'][ORDER][:A].T)
 BANK = Bank(
-    UNITS,
-    velocities=3,
-    speed=float(MIXING['speed_mean']),
-    speed_variance=float(MIXING['speed_variance']),
-    sector=float(MIXING['sector_variance']),
-)
+    UNITS, velocities=3, speed=float(MIXING['speed_mean']),
+    speed_variance=float(MIXING['speed_variance']), sector=float(MIXING['sector_variance']),
+)  # fmt: skip
 
 
 def blocks_of(x, P):
@@ -51,15 +44,6 @@ def given_blocks():
 
 def transition(name='transition_1s'):
     return MIXING[name][np.ix_(ORDER, ORDER)][None]
-
-
-def test_mixing_is_that_of_the_prototype():
-    mixed, c = verbs.mix(BANK, given_blocks(), MIXING['mu'][ORDER][None], transition())
-    due = blocks_of(MIXING['out_x'][ORDER], MIXING['out_P'][ORDER])
-    np.testing.assert_allclose(c[0], MIXING['out_c'][ORDER], rtol=1e-12)
-    for found, right in zip(mixed, due):
-        np.testing.assert_allclose(found.x, right.x, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(found.P, right.P, rtol=1e-12, atol=1e-12)
 
 
 def test_rows_do_not_influence_each_other():
@@ -93,8 +77,7 @@ def test_moments_are_about_the_row_and_not_about_the_origin():
 
 
 def test_states_behind_the_motion_are_mixed_by_identity():
-    """A constant that is the same in all models stays as it is; its correlation with the position
-    is the mean of those of the models."""
+    """A constant that is the same in all models stays as it is."""
     rng = np.random.default_rng(2)
     more = []
     for block in given_blocks():
@@ -194,71 +177,3 @@ def test_without_a_measurement_nothing_changes():
 
 
 # -- the table of rows ---------------------------------------------------------------------------
-
-
-def started(scales):
-    """Rows of one target that begins at the first fix, one for each scale."""
-    K, z, R = len(scales), RUN['z'][0], RUN['R'][0]
-    P0, P1 = np.zeros((K, 3, 3, A)), np.zeros((K, 4, 4, 3))
-    x0, x1 = np.zeros((K, 3, A)), np.zeros((K, 4, 3))
-    x0[:, :2], x1[:, :2], x0[:, 2] = z[:, None], z[:, None], float(MIXING['speed_mean'])
-    for k, scale in enumerate(scales):
-        P0[k, :2, :2] = P1[k, :2, :2] = scale * R[..., None]
-    P0[:, 2, 2], P1[:, 2, 2], P1[:, 3, 3] = float(MIXING['speed_variance']), 0.49, 0.49
-    return Rows(
-        (Gaussians(x0, P0), Gaussians(x1, P1)),
-        np.tile(RUN['start_mu'][ORDER], (K, 1)),
-        np.full(K, -math.log(K)),
-        np.zeros(K, np.int64),
-        np.full(K, -1),
-        {'scale': scales},
-    )
-
-
-def test_a_run_of_scaled_filters_is_that_of_the_prototype():
-    """Sixty fixes whose covariances are stated six times too small."""
-    from sonar_imm.trackers.diver.config import DiverConfig
-    from sonar_imm.trackers.diver.models import build_models
-
-    models = build_models(DiverConfig())
-    generator = MIXING['generator'][np.ix_(ORDER, ORDER)]
-    outputs = np.zeros((4, 3, A)), np.zeros((4, 4, 3))
-    outputs[0][0, 0], outputs[0][1, 1], outputs[0][2, 2], outputs[0][3, 2] = 1.0, 1.0, *UNITS
-    outputs[1][range(4), range(4)] = 1.0
-    scales = RUN['scales']
-    rows, every = started(scales), np.arange(len(scales))
-    for k in range(1, len(RUN['t'])):
-        dt = RUN['t'][k] - RUN['t'][k - 1]
-        F, Q, B = (np.moveaxis(part, 0, -1) for part in models.motion(dt))
-        share = float(RUN['share'])
-        rows = rows.replace(logw=np.log((1.0 - share) * rows.weight + share / len(scales)))
-        blocks, c = verbs.mix(BANK, rows.blocks, rows.mu, expm(generator * dt)[None])
-        blocks = [
-            verbs.predict(blocks[0], Moves(F[:3, :3, :A], Q[:3, :3, :A], B[:3, :A])),
-            verbs.predict(blocks[1], Moves(F[..., A:], Q[..., A:], B[:, A:])),
-        ]
-        z = np.tile(RUN['z'][k], (len(scales), 1))
-        R = RUN['R'][k] * scales[:, None, None]
-        pairs = [verbs.weigh(block, every, z, R) for block in blocks]
-        log = np.concatenate([each.log for each in pairs], axis=1)
-        f = np.log((c * np.exp(log)).sum(axis=1))
-        whole = rows.log_sum(rows.logw + f)
-        ratio = np.split(np.exp(log - whole), [A], axis=1)
-        updated = [
-            verbs.update(block, each, every, part, np.zeros(len(scales)))
-            for block, each, part in zip(blocks, pairs, ratio)
-        ]
-        mu = c * np.concatenate([weight for _, weight in updated], axis=1)
-        total = mu.sum(axis=1)
-        rows = rows.replace(
-            blocks=tuple(block for block, _ in updated),
-            mu=mu / total[:, None],
-            logw=rows.logw + np.log(total),
-        )
-        means = verbs.combine(rows.blocks, rows.mu, outputs)
-        mean, covariance = rows.combine(*means, rows.weight)
-        # The prototype rounds its steps to a microsecond.
-        np.testing.assert_allclose(mean[0], RUN['out_x'][k], atol=1e-5)
-        np.testing.assert_allclose(covariance[0], RUN['out_P'][k], atol=1e-5)
-        np.testing.assert_allclose(rows.weight, RUN['out_scale_probability'][k], atol=1e-5)
-        np.testing.assert_allclose(whole[0], RUN['out_log_likelihood'][k], atol=1e-5)

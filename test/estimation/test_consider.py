@@ -28,8 +28,7 @@ def test_the_update_of_the_vectors():
 
 @pytest.mark.parametrize('mask', [[True] * 5, [True, True, True, False, False], [False] * 5])
 def test_numbers_one_by_one_equal_the_joint_update(mask):
-    """Independent noises: scalar updates in turn are the joint one, for any gain but Schmidt's,
-    whose considered part is not conditioned; so they are compared with the numpy form in turn."""
+    """In turn they are the joint update but for Schmidt's gain: that is compared with numpy."""
     v, mask = vectors('consider_update'), np.array(mask)
     x, P = v['x'].copy(), v['P'].copy()
     y = v['innovation'] + v['H'] @ x

@@ -50,8 +50,7 @@ def is_covariance(P):
 
 
 def ill_conditioned(rng, count, n, m):
-    """Batches of P, F, Q, H, R whose scales lie up to 1e24 apart: nearly and wholly dependent
-    components, measurements that repeat each other, noise that is nothing beside P, or zero."""
+    """Batches of P, F, Q, H, R whose scales lie up to 1e24 apart, dependent, repeated, or zero."""
 
     def covariance(size, low, high):
         root = rng.normal(size=(count, size, size))
@@ -83,10 +82,10 @@ def ill_conditioned(rng, count, n, m):
 
 
 @pytest.mark.parametrize(('n', 'm', 'seed'), [(2, 1, 0), (3, 2, 1), (4, 2, 2), (4, 1, 3)])
-def test_ten_thousand_ill_conditioned_cases_stay_positive_definite(n, m, seed):
-    """2500 for each size, ten steps of the same measurement each."""
+def test_ill_conditioned_cases_stay_positive_definite(n, m, seed):
+    """A thousand of each size, ten steps of the same measurement each."""
     rng = np.random.default_rng(seed)
-    count = 2500
+    count = 1000
     P, F, Q, H, R = ill_conditioned(rng, count, n, m)
     x, v = np.zeros((1, count, n)), np.zeros((1, count, m))
     B = np.zeros((count, n))
@@ -120,8 +119,7 @@ def exact_posterior(P, H, R):
 
 
 def test_a_measurement_much_better_than_the_state():
-    """1e12 against 1e-6, eighteen digits, fifty times: what is claimed along the measurement is
-    neither less than the truth, 1e-6 / k, nor more than the stated limit allows."""
+    """What is claimed is neither less than the truth, 1e-6 / k, nor more than the limit allows."""
     P = np.diag([1e12, 1e12])[None, None]
     h = np.array([1.0, 1.0 + 1e-7])
     H, R = h[None, None, None], np.array([[[1e-6]]])
@@ -141,8 +139,7 @@ def test_a_measurement_much_better_than_the_state():
 @settings(deadline=None, max_examples=300)
 @given(st.integers(2, 4), st.integers(0, 2**32 - 1))
 def test_an_update_is_as_good_as_the_limit_says(n, seed):
-    """Against exact arithmetic, one measured value. Rounding the prior alone changes the result by
-    the rounding over the prior's least eigenvalue."""
+    """Against exact arithmetic: rounding the prior costs rounding over its least eigenvalue."""
     rng = np.random.default_rng(seed)
     P, _, _, H, R = (each[0] for each in ill_conditioned(rng, 1, n, 1))
     exact = np.array(exact_posterior(P, H[0], R[0, 0]), dtype=float)
@@ -154,8 +151,7 @@ def test_an_update_is_as_good_as_the_limit_says(n, seed):
 
 
 def test_a_perfect_component_and_one_repeated():
-    """R with a zero eigenvalue, R slightly below zero by rounding, and two perfect measurements
-    of the same thing: S itself is singular."""
+    """R singular, R slightly below zero, and two perfect measurements: S itself is singular."""
     P = np.tile(np.diag([4.0, 9.0, 1.0]), (3, 1, 1, 1))
     H = np.zeros((3, 1, 2, 3))
     H[:, 0, 0, 0] = 1.0
@@ -231,20 +227,6 @@ def test_numbers_that_are_not_finite_change_nothing_and_are_told(broken):
     out = imm.update(np.zeros((1, 1, 2)), *args, parts['H'][None, None], parts['R'][None])
     assert not out[5].any() and not out[6].any()
     np.testing.assert_array_equal(out[1], args[0])
-
-
-@pytest.mark.parametrize('ratio', [1e6, 1e14, 1e18, 1e24])
-def test_a_diver_seen_far_better_than_known_keeps_a_covariance(ratio):
-    """Position and velocity from one birth and one step without noise are one number; the next
-    fix is `ratio` better. Joseph's form alone made a correlation of this with eigenvalue -.02."""
-    dt, v = 0.08, 400.0
-    P = np.kron(np.array([[v * dt * dt, v * dt], [v * dt, v]]), np.eye(2))[None, None]
-    R = (np.array([[2.1, 2.5], [2.5, 11.0]]) * P[0, 0, 0, 0] / ratio)[None]
-    H = np.eye(2, 4)[None, None]
-    out = imm.update(np.zeros((1, 1, 4)), P, np.ones((1, 1)), np.ones((1, 1, 2)) * 1e-9, H, R)
-    assert is_covariance(out[1])
-    floor = 3.0 * JITTER * P[0, 0, 0, 0]
-    np.testing.assert_allclose(out[1][0, 0, :2, :2], R[0], rtol=1e-4, atol=floor)
 
 
 def test_the_obstacle_update_stays_positive_definite():

@@ -279,8 +279,7 @@ def test_a_measurement_that_no_model_can_use_changes_nothing():
 
 
 def test_unequal_members_by_embedding_equal_a_filter_that_carries_both_sizes():
-    """A walker (position) beside a cruiser (position, velocity): the embedded filter against one
-    written out by hand, in which the walker has no velocity and lends the prior when mixed."""
+    """A walker beside a cruiser, written out by hand: it lends the prior velocity when mixed."""
     dt, fill = 1.0, 0.25
     F = np.array([[1.0, dt], [0.0, 1.0]])
     Q = np.array([[0.1, 0.02], [0.02, 0.05]])

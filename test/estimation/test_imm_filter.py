@@ -73,8 +73,7 @@ def test_equals_filterpy_on_an_asymmetric_chain():
 
 
 def test_where_filterpy_differs_from_the_mathematics():
-    """It lets the chain rest where there is no measurement: the mixing weights are left as they
-    are, and what was not measured moves probabilities. Ours goes to the stationary law."""
+    """It lets the chain rest without a measurement; ours goes to the stationary law."""
     imm, peer = IMM(MODELS, T, **START, measurement=position(1.0)), filterpy_imm()
     for _ in range(200):
         imm.step(None)
@@ -240,8 +239,7 @@ def test_unequal_states_are_mixed_by_their_components():
 
 
 def test_a_model_with_outputs_of_its_own_is_the_same_model():
-    """East at a speed that is the third state, beside standing: a velocity is not a component, and
-    may be measured."""
+    """East at a speed that is a state: a velocity is no component, and may be measured."""
 
     def motion(x: np.ndarray, dt: float) -> Motion:
         F = np.eye(3)

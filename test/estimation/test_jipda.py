@@ -174,12 +174,9 @@ def test_existence_by_class_of_detectability_against_enumeration(monkeypatch):
         for case in cases:
             T = len(case['q'])
             beta, none, after = jipda.associate_classes(
-                case['ratio'],
-                np.ones(case['ratio'].shape, bool),
-                case['q'],
-                np.tile(probability, (T, 1)),
-                case['visible'][:, None],
-            )
+                case['ratio'], np.ones(case['ratio'].shape, bool), case['q'],
+                np.tile(probability, (T, 1)), case['visible'][:, None],
+            )  # fmt: skip
             np.testing.assert_allclose(beta, case[answer], atol=1e-9)
             if largest:
                 np.testing.assert_allclose(none, case['missed'], atol=1e-9)

@@ -31,13 +31,10 @@ def begin(code, cache, *, root=PACKAGE.parent, arguments=(), **environment):
     """A process of its own, with this folder for compiled kernels."""
     environment = {**os.environ, 'NUMBA_CACHE_DIR': str(cache), **environment}
     return subprocess.Popen(
-        [sys.executable, '-c', code, *arguments],
-        cwd=root,
-        env={**environment, 'PYTHONPATH': str(root)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+        [sys.executable, '-c', code, *arguments], cwd=root,
+        env={**environment, 'PYTHONPATH': str(root)}, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
 
 
 def run(code, cache, **options):
@@ -99,8 +96,7 @@ def test_a_mistake_of_a_tracker_is_not_taken_for_a_damaged_file():
 
 
 def test_a_full_disk_ends_the_command_with_one_sentence(tmp_path):
-    """A small file system where one may be mounted; else a limit on the size of files, which fails
-    a write in the same way: after the folder and the file were made."""
+    """A small file system where one may be mounted; else a limit on the size of files."""
     mount = ['mount', '-t', 'tmpfs', '-o', 'size=32k', 'tmpfs', str(tmp_path)]
     small = shutil.which('mount') and not subprocess.run(mount, capture_output=True).returncode
     limit = '' if small else 'import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (9, 9));'
@@ -155,15 +151,8 @@ def test_kernels_of_an_image_load_on_another_processor(tmp_path, anywhere):
     found = []
     for processor in (llvm.get_host_cpu_name(), 'x86-64'):
         words = [
-            'sh',
-            '-ec',
-            start,
-            'sh',
-            TARGET,
-            sys.executable,
-            tmp_path / 'alone.py',
-            processor,
-        ]
+            'sh', '-ec', start, 'sh', TARGET, sys.executable, tmp_path / 'alone.py', processor,
+        ]  # fmt: skip
         done = subprocess.run(words, env=environment, capture_output=True, text=True)
         found.append(done.stdout.split())
     assert found == [['4.0', '1', '0'], ['4.0', '0', '1'] if anywhere else ['4.0', '1', '0']]
@@ -171,12 +160,8 @@ def test_kernels_of_an_image_load_on_another_processor(tmp_path, anywhere):
 
 def test_a_processor_that_was_chosen_stays():
     words = [
-        'sh',
-        '-ec',
-        '. "$1"; echo "$NUMBA_CPU_NAME ${NUMBA_CPU_FEATURES-none}"',
-        'sh',
-        TARGET,
-    ]
+        'sh', '-ec', '. "$1"; echo "$NUMBA_CPU_NAME ${NUMBA_CPU_FEATURES-none}"', 'sh', TARGET,
+    ]  # fmt: skip
     environment = {**os.environ, 'NUMBA_CPU_NAME': 'skylake'}
     environment.pop('NUMBA_CPU_FEATURES', None)
     assert subprocess.check_output(words, env=environment, text=True) == 'skylake none\n'

@@ -24,15 +24,11 @@ import sonar_imm
 PACKAGE = Path(sonar_imm.__file__).parent
 TYPES = {'BoolArray', 'ComplexArray', 'FloatArray', 'IndexArray', 'IntArray'}
 ALLOWED = {
-    'numpy': {'np'},
-    'numpy.typing': {'NDArray'},
-    'math': {'math'},
-    'numba': {'numba'},
+    'numpy': {'np'}, 'numpy.typing': {'NDArray'}, 'math': {'math'}, 'numba': {'numba'},
     'typing': {'Any', 'NamedTuple'},
     **dict.fromkeys(('.jit', '..estimation.jit', '...estimation.jit'), {'kernel'}),
-    '__future__': {'annotations'},
-    **dict.fromkeys(('.arrays', '...estimation.arrays'), TYPES),
-}
+    '__future__': {'annotations'}, **dict.fromkeys(('.arrays', '...estimation.arrays'), TYPES),
+}  # fmt: skip
 """What may be imported, and by which names; of `arrays` the names of types, which no code uses."""
 
 

@@ -88,9 +88,8 @@ def test_every_step_is_the_matrix_exponential(models, seed, exponent):
 
 @pytest.mark.parametrize('dt', [1e-6, 0.1, 0.7, 3.0, 40.0])
 def test_a_defective_generator(dt):
-    """Stages that follow each other at one rate have a single eigenvector; how many are passed in
-    dt is a Poisson number. (The generator of the chain is G but for its last bits. There scipy's
-    `expm` of a triangular matrix is off by .03 at dt = 3, so it is asked about G itself.)"""
+    """Stages of one rate have one eigenvector; how many are passed is a Poisson number. (scipy's
+    `expm` of the nearly triangular matrix is off by .03 at dt = 3: it is asked about G itself.)"""
     stages, rate = 5, 0.9
     G = rate * (np.eye(stages, k=1) - np.eye(stages))
     G[-1] = 0.0

@@ -110,14 +110,3 @@ def test_probabilities_stay_sums_of_one_through_silence_and_nothing():
     for _ in range(5):
         state = chain.update(state, *quiet)
     assert state.onset.max() < 0.2
-
-
-def test_a_floor_that_falls_is_found_again():
-    chain = OnsetChain(0.1, 200, 0.2, 0)
-    state, found = chain.start(), []
-    for floor in [60] * 10 + [150] * 10:
-        there = (np.arange(200) >= floor) & (np.arange(200) < floor + 4)
-        loud = np.where(there, -1.0, -3.0)
-        state = chain.update(state, np.where(there, -30.0, -0.5), loud, loud)
-        found.append(state.found)
-    assert found[9] == 60 and found[11] == 150 and found[-1] == 150

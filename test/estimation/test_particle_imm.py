@@ -71,13 +71,10 @@ def test_where_the_state_says_nothing_it_is_the_forward_algorithm(order):
         return lambda x, k: np.full(len(x), math.log(likelihood[k, j]))
 
     tracker = ParticleIMM(
-        {names[j]: still for j in order},
-        T[np.ix_(order, order)],
-        rng.normal(size=(50, 2)),
-        {names[j]: sensor(j) for j in reversed(order)},
-        rng,
+        {names[j]: still for j in order}, T[np.ix_(order, order)], rng.normal(size=(50, 2)),
+        {names[j]: sensor(j) for j in reversed(order)}, rng,
         initial=np.array([0.2, 0.5, 0.3])[order],
-    )
+    )  # fmt: skip
     assert tracker.names == tuple(names[order])
     for k in range(30):
         tracker.step(None if k in (7, 8) else k)
@@ -89,8 +86,7 @@ def test_where_the_state_says_nothing_it_is_the_forward_algorithm(order):
 
 
 def test_static_states_beside_models_are_a_larger_hidden_markov_model():
-    """Which of four bottoms it is never changes, which of three models holds does: twelve states,
-    of which the filter has the models exactly and the bottoms as particles."""
+    """Which of four bottoms it is never changes: twelve states, the bottoms as particles."""
     rng, bottoms = np.random.default_rng(5), np.arange(4.0)
     emission = rng.dirichlet(np.full(5, 0.7), (3, 4))  # of model and bottom, five kinds of echo
     echoes = rng.integers(5, size=12)
@@ -132,12 +128,9 @@ def test_one_linear_model_is_the_kalman_filter():
     for _ in range(count):
         truth, P = rng.normal(size=2), np.eye(2)
         tracker = ParticleIMM(
-            {'cv': lambda x, rng, dt: x @ F.T + rng.normal(size=x.shape) @ root.T},
-            [[1.0]],
-            rng.normal(size=(3000, 2)),
-            normal(1.0),
-            rng,
-        )
+            {'cv': lambda x, rng, dt: x @ F.T + rng.normal(size=x.shape) @ root.T}, [[1.0]],
+            rng.normal(size=(3000, 2)), normal(1.0), rng,
+        )  # fmt: skip
         x = np.zeros(2)
         log = 0.0
         for _ in range(10):
@@ -190,12 +183,9 @@ Z = np.array([0.1, -0.3, 0.4, 1.7, 2.2, 2.5, 3.9, 4.0])
 def particle_run(seed, transition=TWO, order=(0, 1), count=2000):
     rng = np.random.default_rng(seed)
     tracker = ParticleIMM(
-        {f'm{j}': walk(*MODES[j]) for j in order},
-        transition[np.ix_(order, order)],
-        rng.normal(size=(count, 1)),
-        normal(0.25),
-        rng,
-    )
+        {f'm{j}': walk(*MODES[j]) for j in order}, transition[np.ix_(order, order)],
+        rng.normal(size=(count, 1)), normal(0.25), rng,
+    )  # fmt: skip
     total = 0.0
     for z in Z:
         tracker.step(z)
@@ -250,12 +240,9 @@ def test_a_measurement_that_nothing_explains_changes_nothing():
 def test_a_model_that_cannot_be_comes_back_when_the_chain_allows():
     rng = np.random.default_rng(2)
     tracker = ParticleIMM(
-        {'a': walk(0.1), 'b': walk(0.1)},
-        [[0.9, 0.1], [0.2, 0.8]],
-        rng.normal(size=(100, 1)),
-        {'a': lambda x, z: np.full(len(x), -np.inf), 'b': normal(1.0)},
-        rng,
-    )
+        {'a': walk(0.1), 'b': walk(0.1)}, [[0.9, 0.1], [0.2, 0.8]], rng.normal(size=(100, 1)),
+        {'a': lambda x, z: np.full(len(x), -np.inf), 'b': normal(1.0)}, rng,
+    )  # fmt: skip
     for z in (0.0, 0.1, -0.1):
         tracker.step(z)
         assert tracker.model_probabilities.tolist() == [0.0, 1.0]
@@ -354,23 +341,6 @@ def test_a_function_may_write_into_the_particles_it_is_given():
     first = tracker.particles
     tracker.step(None)
     assert (first == 1.0).all() and set(tracker.particles[0].ravel()) == {2.0}
-
-
-def test_the_filters_need_no_compiler():
-    code = (
-        'import sys, numpy as np\n'
-        'from sonar_imm import cv, hover, IMM, ParticleIMM, position\n'
-        'imm = IMM([cv(0.1), hover(0.1)], np.eye(2), np.zeros(4), np.eye(4), position(1.0))\n'
-        'imm.step([0.0, 0.0])\n'
-        'imm.step([1.0, 0.0], dt=0.5)\n'
-        'imm.smooth()\n'
-        'rng = np.random.default_rng(0)\n'
-        'pf = ParticleIMM({"a": lambda x, rng, dt: x}, [[1.0]], np.ones((5, 1)),\n'
-        '                 lambda x, z: -x[:, 0], rng)\n'
-        'pf.step(0.0)\n'
-        'assert "numba" not in sys.modules'
-    )
-    subprocess.run([sys.executable, '-c', code], check=True)
 
 
 # -- the verbs of IMM -----------------------------------------------------------------------------

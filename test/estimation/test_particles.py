@@ -89,8 +89,7 @@ def test_what_are_no_weights_is_refused(weights):
 
 
 def test_a_point_on_a_boundary_belongs_to_what_begins_there():
-    """A point of zero, which a generator gives now and then, is not of a particle without weight
-    that happens to be the first."""
+    """A point of zero is not of a particle without weight that happens to be the first."""
     cumulative = np.cumsum([0.0, 0.25, 0.0, 0.25, 0.5])
     assert invert(cumulative, np.array([0.0, 0.25, 0.375, 0.5])).tolist() == [1, 3, 3, 4]
 

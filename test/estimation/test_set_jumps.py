@@ -24,17 +24,12 @@ CELLS, JUMP_AT = 11, 3
 @pytest.fixture(scope='module')
 def model():
     return SetModel(
-        cells=CELLS,
-        separation=2,
-        order_min=0,
+        cells=CELLS, separation=2, order_min=0,
         transition=np.array([[0.6, 0.3, 0.1], [0.15, 0.5, 0.35], [0.05, 0.15, 0.8]]),
-        start=np.array([0.2, 0.3, 0.5]),
-        walk=np.array([0.25, 0.6, 0.15]),
-        gram=np.exp(-0.5 * np.square(np.arange(CELLS) / 1.2)),
-        amplitude_std=3.0,
-        negative_probability=0.3,
-        jump=Jump(probability=0.15, std=3.0, step=2, reach=3),
-    )
+        start=np.array([0.2, 0.3, 0.5]), walk=np.array([0.25, 0.6, 0.15]),
+        gram=np.exp(-0.5 * np.square(np.arange(CELLS) / 1.2)), amplitude_std=3.0,
+        negative_probability=0.3, jump=Jump(probability=0.15, std=3.0, step=2, reach=3),
+    )  # fmt: skip
 
 
 @pytest.fixture(scope='module')

@@ -39,13 +39,9 @@ from sonar_imm.estimation.set_shifts import Shift
 N = 400
 GRAM = np.sinc(np.arange(N) / 5.0)
 MODEL = SetModel(
-    cells=N,
-    separation=20,
-    order_min=1,
-    transition=banded_transition(12, 0.05),
-    walk=gaussian_walk(4.0),
-    gram=GRAM,
-)
+    cells=N, separation=20, order_min=1, transition=banded_transition(12, 0.05),
+    walk=gaussian_walk(4.0), gram=GRAM,
+)  # fmt: skip
 PLACES = np.array([40, 85, 112, 160, 203, 251, 300, 352])
 SIGMAS = np.array([34.0, 6.0, 28.0, 7.0, 22.0, 9.0, 30.0, 8.0])
 
@@ -127,15 +123,9 @@ def test_before_the_first_record_members_neither_come_nor_go(start):
     """The orders of a first record by the sum over all sets and all that they walk."""
     n, walk = 10, np.array([0.25, 0.5, 0.25])
     model = SetModel(
-        cells=n,
-        separation=2,
-        order_min=0,
-        transition=banded_transition(3, 0.2),
-        walk=walk,
-        gram=np.exp(-0.5 * np.arange(n) ** 2.0),
-        amplitude_std=3.0,
-        start=start,
-    )
+        cells=n, separation=2, order_min=0, transition=banded_transition(3, 0.2), walk=walk,
+        gram=np.exp(-0.5 * np.arange(n) ** 2.0), amplitude_std=3.0, start=start,
+    )  # fmt: skip
     b = np.random.default_rng(8).standard_normal(n)
     b[[2, 3, 7]] += 2.0, 3.0, 1.5
     exact = np.zeros(3)
@@ -159,8 +149,7 @@ def test_before_the_first_record_members_neither_come_nor_go(start):
 @pytest.mark.parametrize('wide', [False, True])
 @pytest.mark.parametrize('all_sums', [False, True])
 def test_walks_are_drawn_by_what_they_come_to(wide, all_sums):
-    """Member by member, for walks of two kinds, of which one has a gap and leads aside; also
-    where it sees a peak that it cannot reach and whose worth is beyond numbers beside others."""
+    """Walks of two kinds, one with a gap and aside; also beside a peak that is out of reach."""
     n, share, rng = 30, 0.8, np.random.default_rng(2)
     g = 8.0 * rng.random((2, n))
     if not wide:

@@ -8,6 +8,7 @@
 
 """Helpers of the obstacle tests: recorded approaches as measurements, runs, errors."""
 
+import functools
 import json
 from pathlib import Path
 
@@ -36,10 +37,12 @@ FAITHFUL = {
 """A tracker that does what the exact posterior of the vectors does."""
 
 
+@functools.cache
 def meta(name):
     return json.loads((VECTORS / 'approach_meta.json').read_text())[f'{name}.csv']
 
 
+@functools.cache
 def rows(name):
     return np.genfromtxt(VECTORS / f'{name}.csv', delimiter=',', names=True)
 

@@ -8,6 +8,7 @@
 
 """Recorded encounters at sea: measurements, truth, and the answers of an independent filter."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,13 @@ def track(data, altitude=True, **values):
     lever = tuple(float(value) for value in data['sonar_lever_flu'])
     config = ObstacleConfig(sonar_lever=lever, **{**AS_STATED, **values})
     return list(run(ObstacleTracker(config), measurements(data, altitude)).values())
+
+
+@functools.cache
+def tracked(name, number=0, **values):
+    """The arrays of an encounter and the estimates of it."""
+    data = encounter(name, number)
+    return data, track(data, **values)
 
 
 def column(estimates, name, pings):

@@ -69,29 +69,11 @@ def memory():
 
 
 GADGETS = [
-    'subprocess.Popen',
-    'Popen',
-    'os.system',
-    'antigravity',
-    'sonar_imm.trackers.diver.tracker.DiverTracker',
-    'DiverTracker',
-    'DiverConfig',
-    'ReplayStream',
-    'KnownFrames',
-    'Decoder',
-    'Saved',
-    'Path',
-    'type',
-    'object',
-    'Trap',
-    'test_hostile_state.Trap',
-    'Origin',
-    '',
-    5,
-    None,
-    ['Fix'],
-    {'class': 'Fix'},
-]
+    'subprocess.Popen', 'Popen', 'os.system', 'antigravity',
+    'sonar_imm.trackers.diver.tracker.DiverTracker', 'DiverTracker', 'DiverConfig', 'ReplayStream',
+    'KnownFrames', 'Decoder', 'Saved', 'Path', 'type', 'object', 'Trap', 'test_hostile_state.Trap',
+    'Origin', '', 5, None, ['Fix'], {'class': 'Fix'},
+]  # fmt: skip
 """Classes and more that modules lead to, and that do not stand in a state, or not there."""
 
 
@@ -107,8 +89,8 @@ def test_a_name_only_chooses_from_the_table(file):
     places = [owner for owner, key in places_in(header['state']) if key == 'class']
     assert {place['class'] for place in places} >= {'Fix', 'Tracks'}
     kinds = {place['class']: place for place in places}.values()
-    for gadget in GADGETS:
-        for place in kinds:
+    for k, gadget in enumerate(GADGETS):
+        for place in [*kinds][k % 4 :: 4]:
             whole = dict(place)
             place['class'] = gadget
             forge(file, header, arrays)
@@ -308,7 +290,7 @@ def test_a_file_that_grows_is_not_read_to_its_end():
 @pytest.mark.parametrize('name', RECORDED)
 def test_damaged_and_forged_states_are_a_sentence_or_are_lived_with(name):
     """A share of what `make fuzz` tries; a kernel that took an index from a file would crash."""
-    _, failures = states_damaged(name, 150)
+    _, failures = states_damaged(name, 60)
     assert not failures
 
 

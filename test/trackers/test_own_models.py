@@ -172,13 +172,10 @@ def test_a_set_gives_the_estimates_of_the_same_filter_alone(installed):
     made = run(DiverTracker(config), [first, *others])
     own = registered(MODELS, 'tiny_turns').load()(config)
     imm = IMM(
-        own.models,
-        own.transition,
-        [*first.position[:2], 0.0, 0.0],
-        np.diag([0.25, 0.25, *[config.velocity_std**2] * 2]),
-        position(0.5),
+        own.models, own.transition, [*first.position[:2], 0.0, 0.0],
+        np.diag([0.25, 0.25, *[config.velocity_std**2] * 2]), position(0.5),
         stamp=first.stamp_ns / 1e9,
-    )
+    )  # fmt: skip
     for item, mine in zip(others, made[1:], strict=True):
         imm.step(item.position[:2], stamp=item.stamp_ns / 1e9)
         assert mine.state[0] == pytest.approx(imm.estimate.mean, rel=1e-9, abs=1e-9)
@@ -216,16 +213,6 @@ def test_a_behaviour_written_again_gives_the_same_estimates(installed):
         assert found == pytest.approx(reference.extras['prob_moving'], abs=1e-9)
         moving = max([moving, *found])
     assert moving > 0.9
-
-
-def test_beside_the_built_in_ones(installed):
-    names = 'fixed', 'moving', 'tiny_mover'
-    _, final = track_scene('movers', 1, behaviours=names)
-    extras = list(final.values())[-1].extras
-    total = sum(extras[f'prob_{name}'] for name in names)
-    assert total == pytest.approx(1.0) and extras['prob_tiny_mover'] == pytest.approx(
-        extras['prob_moving']
-    )
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,6 @@ from sonar_imm.trackers.model_checks import chain_problems, matrix_problems
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm.trackers.shared_parameters import (
     DetectionParameters,
-    OriginParameters,
     StampParameters,
     StreamParameters,
     TrackLifeParameters,
@@ -81,19 +80,8 @@ def test_only_what_a_base_has_can_be_inherited():
         inherited(Left, 'third', False)
 
 
-@pytest.mark.parametrize('kind', [SYSTEMS['diver'].config_type(), ObstacleNodeConfig])
-def test_an_origin_is_three_numbers_on_earth(kind):
-    assert kind(origin=(54.0, 0.0, 40.0)).stated_origin() == Origin(54.0, 0.0, 40.0)
-    assert kind().stated_origin() is None and kind(origin=(0, 0, 40)).stated_origin() is None
-    with pytest.raises(ConfigError, match='three values, got 2'):
-        kind(origin=(54.0, 10.0))
-    with pytest.raises(ConfigError, match='origin: latitude must be between -90 and 90, got 91'):
-        kind(origin=(91.0, 10.0, 0.0))
-
-
 def test_a_parameter_may_change_in_all_systems_or_in_none():
-    """Pings of the bathymetry tracker share no state: everything may change there but the frames,
-    whose transform is looked for once."""
+    """Pings of the bathymetry tracker share no state: all may change there but the frames."""
     flags: dict[str, set[bool]] = {}
     for name, system in SYSTEMS.items():
         specs = system.config_type().specs()
@@ -183,20 +171,20 @@ def test_the_fathometer_believes_a_restarted_clock_after_so_many_records():
 ORIGIN_ENDS = (90.0, 360.0, 12000.0)
 
 
-@pytest.mark.parametrize('sign', [1.0, -1.0])
-@pytest.mark.parametrize('place, name', [(0, 'latitude'), (1, 'longitude'), (2, 'height')])
-def test_the_end_of_a_range_belongs_to_it(place, name, sign):
-    origin = [1.0, 2.0, 3.0]
-    origin[place] = sign * ORIGIN_ENDS[place]
-    assert OriginParameters.from_mapping({'origin': origin}).origin == tuple(origin)
-    origin[place] = sign * (ORIGIN_ENDS[place] + 0.1)
-    with pytest.raises(ConfigError, match=f'origin: {name} must be between') as caught:
-        OriginParameters.from_mapping({'origin': origin})
-    assert len(caught.value.problems) == 1
-
-
-@pytest.mark.parametrize(
-    'origin, stated', [((0.0, 0.0, 5.0), False), ((0.0, 1.0, 0.0), True), ((1.0, 0.0, 0.0), True)]
-)
-def test_an_origin_on_the_equator_is_one(origin, stated):
-    assert bool(OriginParameters(origin=origin).stated_origin()) == stated
+@pytest.mark.parametrize('kind', [SYSTEMS['diver'].config_type(), ObstacleNodeConfig])
+def test_an_origin_is_three_numbers_on_earth(kind):
+    """The ends of a range belong to it, and so does the equator; of nothing else zeros are one."""
+    for stated in ((54.0, 0.0, 40.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)):
+        assert kind(origin=stated).stated_origin() == Origin(*stated)
+    assert kind().stated_origin() is None and kind(origin=(0, 0, 40)).stated_origin() is None
+    with pytest.raises(ConfigError, match='three values, got 2'):
+        kind(origin=(54.0, 10.0))
+    for place, name in enumerate(('latitude', 'longitude', 'height')):
+        for end in (ORIGIN_ENDS[place], -ORIGIN_ENDS[place]):
+            origin = [1.0, 2.0, 3.0]
+            origin[place] = end
+            assert kind.from_mapping({'origin': origin}).origin == tuple(origin)
+            origin[place] *= 1.001
+            with pytest.raises(ConfigError, match=f'origin: {name} must be between') as caught:
+                kind.from_mapping({'origin': origin})
+            assert len(caught.value.problems) == 1

@@ -65,8 +65,7 @@ def test_a_floor_that_they_see_differently_is_followed_when_told():
 
 
 def test_a_lobe_beside_the_floor_is_not_taken_for_one():
-    """Seen by two staves far apart a level floor is a slope in the next lobe, too: of these pings
-    one begins there when the start is one Gaussian."""
+    """A level floor is a slope in the next lobe, too: one ping began there from one Gaussian."""
     config = scenario('paper', {**WIDE, 'pings': 5, 'decorrelation': 0.2, 'patch_std': 0.0})
     tracker = BathymetryTracker(
         BathymetryConfig.from_mapping({**config.instruments(), 'decorrelation': 0.2})
@@ -125,12 +124,9 @@ def test_decorrelation_is_noise_that_grows_with_the_echo():
     config = scenario('paper', {'pings': 1, 'last_range': 20.0})
     ping = simulate(config, 1).measurements[0].measurement
     given = BathymetryConfig(
-        model_set='height_two_rw',
-        decorrelation=0.25,
-        engine='grid',
-        gate_false_alarm=1.0,
+        model_set='height_two_rw', decorrelation=0.25, engine='grid', gate_false_alarm=1.0,
         sound_speed_std=2.0,
-    )
+    )  # fmt: skip
     each = BathymetryTracker(given).process(ping)[0]
     signal = np.maximum(
         np.convolve(np.square(np.abs(ping.iq)).mean(axis=1), np.ones(21), 'same')
@@ -139,12 +135,9 @@ def test_decorrelation_is_noise_that_grows_with_the_echo():
         0.01,
     )
     stated = type(ping)(
-        stamp_ns=ping.stamp_ns,
-        range=ping.range,
-        iq=ping.iq,
-        noise_variance=1.0 + 0.25 * signal,
+        stamp_ns=ping.stamp_ns, range=ping.range, iq=ping.iq, noise_variance=1.0 + 0.25 * signal,
         signal_variance=0.75 * signal,
-    )
+    )  # fmt: skip
     same = BathymetryTracker(evolve(given, decorrelation=0.0)).process(stated)[0]
     assert each.state == pytest.approx(same.state, abs=1e-9)
     assert each.covariance == pytest.approx(same.covariance, abs=1e-9)

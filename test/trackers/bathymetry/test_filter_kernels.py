@@ -54,12 +54,9 @@ def make_case(
         base, form, spread = parts.base, -signal[:, None] * parts.beam, parts.spread
     tilt = rng.uniform(0.3, 0.6, T)
     geometry = level_geometry(ranges, 15.0, 0.5, 0.5, of_heights=heights)._replace(
-        height=rng.normal(15.0, 0.3, T),
-        tilt=tilt,
-        cos_tilt=np.cos(tilt),
-        sin_tilt=np.sin(tilt),
+        height=rng.normal(15.0, 0.3, T), tilt=tilt, cos_tilt=np.cos(tilt), sin_tilt=np.sin(tilt),
         drift_from=1,
-    )
+    )  # fmt: skip
     if bent:
         profile = rays.profile_of([0.0, 1520.0, 8.0, 1500.0, 20.0, 1490.0])
         table = rays.launch_table(profile, 5.0, ranges[-1], 1500.0)
@@ -81,13 +78,10 @@ def make_case(
         favour=rng.uniform(0.2, 2.0, (T, M)) if favours else np.empty((0, M)),
     )
     return SimpleNamespace(
-        start=kernels.Particles(x, w, probability if mu is None else mu),
-        models=models,
+        start=kernels.Particles(x, w, probability if mu is None else mu), models=models,
         chains=np.stack([ASYMMETRIC if mu is None else np.eye(M), np.eye(M)][: 1 + again]),
-        uniform=rng.random((T, 2, M)),
-        noise=rng.normal(size=(T, M, 2, N)),
-        ping=likelihood,
-    )
+        uniform=rng.random((T, 2, M)), noise=rng.normal(size=(T, M, 2, N)), ping=likelihood,
+    )  # fmt: skip
 
 
 def compiled(case):
@@ -137,7 +131,7 @@ def in_numpy(case):
     ],
     ids=lambda options: ' '.join(options) or 'plain',
 )
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_the_kernel_gives_the_bits_of_the_verbs_in_numpy(options, seed):
     echo = np.random.default_rng(seed).random(9) < 0.8
     echo[1:3] = False, True

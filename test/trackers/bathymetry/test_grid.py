@@ -6,13 +6,14 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Point masses: Kalman filter and smoother, the dense form, and the kernels on windows."""
+"""Point masses: Kalman filter and smoother, the dense form, kernels on windows, exp of a row."""
 
 import numpy as np
 from oracles.grid import filter_densities, walk_matrix
 import pytest
 
 from sonar_imm.trackers.bathymetry import grid_kernels as grid
+from sonar_imm.trackers.bathymetry.grid_kernels import exponentials, phasors
 
 CELLS = np.arange(-400, 401) * 0.05
 ASYMMETRIC = np.array([[0.95, 0.05], [0.3, 0.7]])
@@ -100,3 +101,36 @@ def test_a_walk_narrower_than_a_cell_keeps_its_variance(sigma):
     out, scratch = np.empty(9), np.empty((7, 144))
     grid.walk(np.eye(9)[4], 0, 9, sigma, scratch, out, 0, 9)
     assert out == pytest.approx(W[4], abs=1e-15)
+
+
+def row(values):
+    values = np.array(values, float)
+    out = np.empty_like(values)
+    exponentials(values, np.empty_like(values), out)
+    return out
+
+
+def test_exponentials_are_those_of_the_library():
+    values = np.concatenate([-np.logspace(-18, np.log10(699.0), 20_001), np.linspace(-2, 0, 9999)])
+    exact = np.exp(values)
+    assert (np.abs(row(values) - exact) <= 4e-16 * exact).all()
+    assert row([0.0])[0] == 1.0
+
+
+def test_what_is_impossible_is_zero():
+    assert (row([-np.inf, np.nan, -701.0, -1e300]) == 0.0).all()
+
+
+def test_a_row_gives_the_same_bits_however_it_is_cut():
+    values = -np.random.default_rng(1).exponential(30.0, 101)
+    whole = row(values)
+    assert all(row([value])[0] == expected for value, expected in zip(values, whole))
+
+
+def test_phasors_are_cosines_and_sines():
+    values = np.concatenate([np.linspace(-60.0, 60.0, 4001), [np.nan]])
+    cosine, sine = np.empty_like(values), np.empty_like(values)
+    phasors(values, 0.7, cosine, sine)
+    assert np.abs(cosine - np.cos(1.4 * np.pi * values))[:-1].max() < 1e-13
+    assert np.abs(sine - np.sin(1.4 * np.pi * values))[:-1].max() < 1e-13
+    assert np.isnan(cosine[-1]) and np.isnan(sine[-1])

@@ -51,12 +51,9 @@ def test_the_error_of_one_snapshot_is_that_of_the_reference_ping():
     r = case['r']
     decibels = 30.0 - 20.0 * np.log(r / 17.0) / np.log(77.0 / 17.0)
     snapshot = Snapshot(
-        stamp_ns=1,
-        range=r,
-        iq=(y[..., 0] + 1j * y[..., 1]).astype(np.complex64),
-        noise_variance=np.ones(len(r)),
-        signal_variance=10.0 ** (0.1 * decibels),
-    )
+        stamp_ns=1, range=r, iq=(y[..., 0] + 1j * y[..., 1]).astype(np.complex64),
+        noise_variance=np.ones(len(r)), signal_variance=10.0 ** (0.1 * decibels),
+    )  # fmt: skip
     seen = look(Ping(TERRAIN, snapshot, None))
     std = seen.swath.snapshot_std(
         seen.swath.floor(np.zeros(len(r)), np.ones(len(r))).angle,
@@ -116,17 +113,6 @@ def test_a_slope_is_smooth_floor_and_scatter_is_rough():
     assert np.sqrt(np.mean(error**2)) < 0.1  # of the bins, not of the base
     held = np.abs(error) < 2.0 * np.sqrt(rough.covariance[:, 0, 0])
     assert held.mean() > 0.9
-
-
-def test_bins_without_an_echo_cannot_be_told_and_the_ping_goes_on():
-    snapshot = floor(0.0, shadow=slice(100, 160))
-    (estimate,) = BathymetryTracker(TERRAIN).process(snapshot)
-    silent = estimate.extras['valid'] == 0
-    assert silent[105:155].all() and (estimate.extras['told'][silent] == 2).all()
-    assert np.isfinite(estimate.state).all() and (estimate.covariance[:, 0, 0] > 0.0).all()
-    assert np.abs(estimate.state[170:, 0]).max() < 0.3
-    inside, before = estimate.covariance[130, 0, 0], estimate.covariance[90, 0, 0]
-    assert inside > before
 
 
 def test_neighbours_lean_on_each_other_in_terrain_too():

@@ -15,18 +15,8 @@ import numpy as np
 import pytest
 
 from sonar_imm.acoustics.calibration import Calibration
-from sonar_imm.intake import Intake
-from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.bathymetry.findings import stave_warnings
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-from sonar_imm.trackers.state_file import (
-    intake_from,
-    json_parameters,
-    read_state,
-    Saved,
-    state_of,
-    write_state,
-)
 
 RANGES = 17.0 + 0.05 * np.arange(700)
 PATCH = (RANGES > 30.0) & (RANGES < 40.0)
@@ -173,29 +163,6 @@ def test_each_side_has_a_sign_of_its_own():
     assert scores['patch'] < 0.4
     tracker.reconfigure(evolve(tracker.config, conjugate=True))
     assert tracker._signs == {}
-
-
-def test_a_saved_state_knows_staves_and_sign(tmp_path):
-    system = SYSTEMS['bathymetry']
-    config = BathymetryConfig(**EXACT)
-    intake = Intake(system.build(config), '')
-    spoiled = list(pings(lambda iq: np.conj(without(iq, 2)), count=7))
-    for snapshot in spoiled[:6]:
-        intake.tracker.process(snapshot)
-    path = tmp_path / 'state'
-    saved = Saved(
-        system='bathymetry',
-        parameters=json_parameters(config),
-        saved_ns=1,
-        newest_ns=2,
-        state=state_of(intake),
-    )
-    write_state(path, saved)
-    again = intake_from(read_state(path), system, config).tracker
-    assert again.warnings() == intake.tracker.warnings() and len(again.warnings()) == 2
-    assert again.array() == intake.tracker.array()
-    (ours,), (theirs,) = again.process(spoiled[6]), intake.tracker.process(spoiled[6])
-    assert np.array_equal(ours.state, theirs.state)
 
 
 def test_pings_of_other_arrays_and_without_echoes_do_not_count():

@@ -103,19 +103,10 @@ def of_one(mean, std, width=0.05, **changed):
 def of_several(terrain, mean, std):
     M = len(terrain.names)
     return TerrainModels(
-        names=terrain.names,
-        state_names=('height',),
-        F=np.ones((M, 1, 1)),
-        G=np.zeros((M, 1, 1)),
-        scale=np.zeros((1, M)),
-        transition=terrain.transition,
-        initial=terrain.stationary,
-        mean=np.array([mean]),
-        std=np.array([std]),
-        coast=0,
-        rough=terrain.rough,
-        terrain=terrain,
-    )
+        names=terrain.names, state_names=('height',), F=np.ones((M, 1, 1)), G=np.zeros((M, 1, 1)),
+        scale=np.zeros((1, M)), transition=terrain.transition, initial=terrain.stationary,
+        mean=np.array([mean]), std=np.array([std]), coast=0, rough=terrain.rough, terrain=terrain,
+    )  # fmt: skip
 
 
 def seen(iq, ranges, rho, **config):
@@ -163,17 +154,13 @@ def test_whole_pings_are_those_of_the_vectors(name):
 
 WIDTH, BASE, SLOPES = 1.0, np.linspace(-4.0, 4.0, 101), np.linspace(-1.05, 1.05, 15)
 THREE = Terrain(
-    names=('level', 'steady', 'scatter'),
-    rough=np.array([False, False, True]),
-    walk=np.array([0.1, 0.1, 0.15]),
-    phi=np.array([0.0, 0.9, 0.0]),
-    follow=np.array([False, True, False]),
-    scatter=np.array([0.0, 0.0, 0.5]),
+    names=('level', 'steady', 'scatter'), rough=np.array([False, False, True]),
+    walk=np.array([0.1, 0.1, 0.15]), phi=np.array([0.0, 0.9, 0.0]),
+    follow=np.array([False, True, False]), scatter=np.array([0.0, 0.0, 0.5]),
     coast=np.array([0, 1, 0]),
     transition=np.array([[0.86, 0.04, 0.1], [0.02, 0.93, 0.05], [0.2, 0.2, 0.6]]),
-    stationary=np.array([2.0, 4.0, 1.0]) / 7.0,
-    width=WIDTH,
-)
+    stationary=np.array([2.0, 4.0, 1.0]) / 7.0, width=WIDTH,
+)  # fmt: skip
 
 
 def hills(T=30, seed=3):
@@ -206,18 +193,9 @@ def exact(terrain, silent=()):
     )
     kinds = zip(terrain.walk, terrain.phi, terrain.follow, terrain.scatter)
     cells = smoothed(
-        (0.0, 1.0),
-        BASE,
-        SLOPES,
-        list(kinds),
-        terrain.transition,
-        terrain.stationary,
-        SLOPE0,
-        WIDTH,
-        logs,
-        echo,
-        terrain.coast.tolist(),
-    )
+        (0.0, 1.0), BASE, SLOPES, list(kinds), terrain.transition, terrain.stationary, SLOPE0,
+        WIDTH, logs, echo, terrain.coast.tolist(),
+    )  # fmt: skip
     return made, cells
 
 
@@ -243,22 +221,6 @@ def test_both_ways_are_those_of_a_filter_on_cells(terrain, silent):
         ratio = track.covariance[:, 0, 0] / answer.variance
         assert 0.8 < ratio.min() and ratio.max() < 1.25
         assert track.log_likelihood == pytest.approx(answer.log_likelihood, abs=0.15)
-
-
-@pytest.mark.parametrize(
-    'wrong',
-    [
-        {'scatter': np.array([0.0, 0.0, 0.3])},
-        {'phi': np.array([0.0, 0.7, 0.0])},
-        {'transition': THREE.transition.T / THREE.transition.sum(axis=0)[:, None]},
-    ],
-    ids=['scatter', 'phi', 'transposed'],
-)
-def test_another_model_is_found_out(wrong):
-    (_, whole), _ = exact(THREE._replace(**wrong))
-    _, (_, cells) = exact(THREE)
-    _, mean, probability = far(whole, cells)
-    assert mean > 0.06 or probability > 0.02
 
 
 def test_the_slope_is_turned_round_for_the_inward_filter():
@@ -340,8 +302,7 @@ def test_half_of_the_log_likelihood_is_what_a_factor_says():
 
 
 def test_what_favours_a_model_counts_once():
-    """Before the last bin only the outward filter has been there: the share of a model there is
-    multiplied by the factor, not by its square."""
+    """Its share before the last bin is multiplied by the factor, not by its square."""
     ranges = 20.0 + 0.05 * np.arange(60)
     ping = look(Ping(TERRAIN, floor(0.0, ranges=ranges), None))
     peak = ping.swath.height_from(ping.loudest)

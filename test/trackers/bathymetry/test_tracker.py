@@ -131,15 +131,6 @@ def test_seed_stamp_and_side_name_the_random_numbers():
         assert rmse(first, other.columns()['height']) < 0.15
 
 
-def test_a_conjugated_array_is_a_matter_of_wiring():
-    wired, other = floor(PATCH), floor(PATCH, conjugate=True)
-    assert rmse(run(other, conjugate=True), PATCH) == pytest.approx(
-        rmse(run(wired), PATCH), rel=0.3
-    )
-    assert rmse(run(other, conjugate_auto=False), PATCH) > 1.0
-    assert rmse(run(other), PATCH) == pytest.approx(rmse(run(wired), PATCH), rel=0.3)
-
-
 def test_staves_are_taken_as_they_come():
     for P in (2, 3, 16, 64):
         estimate = run(floor(PATCH, P=P), gate_false_alarm=1.0)

@@ -71,8 +71,7 @@ def test_the_grid_smoother_is_the_exact_smoother(name):
 
 @pytest.mark.parametrize('engine, tolerance', [('grid', 2e-4), ('particles', 0.05)])
 def test_log_likelihood_of_each_bin(engine, tolerance):
-    """The reference leaves out what does not depend on the direction; so does the difference of
-    two bins less the logarithm of the determinants."""
+    """The reference leaves out what does not depend on the direction; so do differences."""
     case, config, snapshot = vector('set_ii_0')
     estimate = run(evolve(config, engine=engine), snapshot)
     constant = np.log(2.0) - 8.0 * np.log(np.pi) - np.log1p(8.0 * case['rho'])

@@ -235,23 +235,8 @@ def test_a_burst_among_several_divers_takes_no_identity():
     assert any('taken for bursts' in each for each in tracker.warnings())
 
 
-def test_a_burst_that_follows_another_one_takes_no_identity():
-    t = np.arange(70.0)
-    truth = np.column_stack([0.5 * t - 20.0, 0.0 * t])[:, None]
-    seen = truth.copy()
-    seen[40:46, 0] += [15.0, -20.0]
-    seen[46:52, 0] += [-18.0, 16.0]
-    tracker = DiverTracker(DiverConfig())
-    made = [tracker.process(scan)[-1] for scan in scans(seen, seed=3)]
-    before, (ids, place) = confirmed(made[38]), confirmed(made[-1])
-    assert before[0] == ids and len(ids) == 1
-    assert np.hypot(*(place[0] - truth[-1, 0])) < 3.0
-    assert all(confirmed(each)[0] == ids for each in made[40:])
-
-
 def test_a_burst_excludes_a_track_though_its_second_fix_is_missing():
-    """The track that the first fix begins does not end before the burst, or a new target would be
-    lost to it."""
+    """What its first fix begins does not end before it: a new target would be lost to it."""
     t = np.arange(60.0)
     truth = np.column_stack([0.5 * t - 20.0, 0.0 * t])[:, None]
     seen = truth.copy()

@@ -205,8 +205,7 @@ def test_false_fixes_in_a_clump_begin_no_track_for_long():
 
 
 def test_new_targets_arrive_in_time():
-    """Twice the time between scans, twice the new targets; several instruments of one name, and
-    several messages of one stamp, take nothing from one another."""
+    """Twice the time, twice the new targets; instruments and messages take nothing from others."""
     steady, looks = Clutters(), []
     for scan in range(1, 6):
         steady, elapsed = steady.with_look('a', scan * SECOND // 2)

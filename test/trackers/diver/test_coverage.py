@@ -112,8 +112,7 @@ def test_existence_of_a_diver_who_is_not_seen_is_the_closed_recursion(tmp_path):
 
 
 def test_existence_at_the_edge_is_that_of_particles_told_the_true_probability():
-    """A diver who swims out of the sector, and is not seen any more: 40,000 particles with the
-    motion of the tracker, weighed by 1 - p(x) with each empty scan."""
+    """40,000 particles with the motion of the tracker, weighed by 1 - p(x) with each scan."""
     config = DiverConfig(
         association='jipda', model_set='linear', acceleration_noise=(0.1,), coverage_sector=AHEAD
     )
@@ -238,14 +237,10 @@ def test_sectors_that_are_none_are_refused(values, problem):
     ],
 )
 def test_files_that_hold_no_table_are_refused(tmp_path, header, rows, problem):
-    config = DiverConfig(coverage_file=written(tmp_path, 'table.csv', header, rows))
-    with pytest.raises(ConfigError, match=problem):
-        DiverTracker(config)
-
-
-def test_a_file_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match='nowhere.csv'):
-        DiverTracker(DiverConfig(coverage_file=str(tmp_path / 'nowhere.csv')))
+    file = written(tmp_path, 'table.csv', header, rows)
+    for name, said in ((file, problem), (file + '.no', 'table.csv.no')):
+        with pytest.raises(ConfigError, match=said):
+            DiverTracker(DiverConfig(coverage_file=name))
 
 
 def test_a_running_tracker_takes_another_sector():

@@ -118,12 +118,8 @@ def test_the_account_of_innovations():
     firm, own, earlier = short(now[[0, 2, 3]]), short(now[[0, 3]]), short(before[[0, 3]])
     assert np.sum(now[3] ** 2) > 2.0 * FARTHEST and np.sum(now[0] ** 2) < 2.0 * FARTHEST
     want = np.array(old[:5]) + [
-        3.0,
-        0.5 * np.sum(firm**2),
-        2.0,
-        np.sum(own * earlier),
-        0.5 * np.sum(own**2 + earlier**2),
-    ]
+        3.0, 0.5 * np.sum(firm**2), 2.0, np.sum(own * earlier), 0.5 * np.sum(own**2 + earlier**2),
+    ]  # fmt: skip
     np.testing.assert_allclose(new[:5], want * MEMORY / want[0])
 
 

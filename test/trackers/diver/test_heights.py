@@ -34,12 +34,9 @@ from sonar_imm.trackers.diver.tracker import DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 CV = {
-    'model_set': 'linear',
-    'association': 'gnn',
-    'max_tracks': 1,
-    'dimensions': 3,
+    'model_set': 'linear', 'association': 'gnn', 'max_tracks': 1, 'dimensions': 3,
     'gate_probability': 0.999999,
-}
+}  # fmt: skip
 Z, W = 2, 5
 """Of z and its rate in the published state."""
 
@@ -251,11 +248,8 @@ def test_latitude_and_longitude_and_what_a_transceiver_sees_bring_their_heights(
     origin = Origin(54.0, 10.0, 40.0)
     latitude, longitude, height = origin.geodetic(np.array([30.0, 40.0, -12.0])).tolist()
     settings = {
-        'origin': (54.0, 10.0, 40.0),
-        'dimensions': 3,
-        'max_tracks': 1,
-        'vessel': 'fixed',
-    }
+        'origin': (54.0, 10.0, 40.0), 'dimensions': 3, 'max_tracks': 1, 'vessel': 'fixed',
+    }  # fmt: skip
     place = {'latitude': latitude, 'longitude': longitude, 'covariance': spatial(0.25)}
     geodetic = [GeodeticFix(stamp_ns=k * 10**9, height=height, **place) for k in range(1, 9)]
     estimate = last(DiverTracker(DiverConfig(**settings)), geodetic)

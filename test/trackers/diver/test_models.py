@@ -62,13 +62,9 @@ def test_ten_short_steps_are_one_long_step(model_set):
 
 def test_the_set_is_that_of_the_reference():
     config = DiverConfig(
-        model_set='heading_speed',
-        stay_probability=0.88,
-        heading_concentration=2.0,
-        speed_noise=0.03,
-        lateral_noise=0.2,
-        hover_noise=0.05,
-    )
+        model_set='heading_speed', stay_probability=0.88, heading_concentration=2.0,
+        speed_noise=0.03, lateral_noise=0.2, hover_noise=0.05,
+    )  # fmt: skip
     models = build_models(config)
     F, Q, B = models.motion(1.0)
     ours = {'F': F, 'B': B, 'E': models.E, 'Pi': models.chain.matrix}

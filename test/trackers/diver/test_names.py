@@ -94,31 +94,6 @@ def test_names_without_a_track_are_not_kept():
     assert len(tracker._stream.state.memory['last_named']) < 100
 
 
-@pytest.mark.parametrize('association', BOTH)
-def test_order_inside_the_window_changes_no_bit_with_names(association):
-    rng = np.random.default_rng(8)
-    measurements = []
-    for second in range(1, 30):
-        place = np.array([0.5 * second, 0.0])
-        measurements.append(scan(second, place + 0.3 * rng.normal(size=2), (20.0, 20.0)))
-        if second % 3 == 0:
-            measurements.append(named(second + 0.4, place + rng.normal(size=2), 5))
-    config = DiverConfig(association=association)
-
-    def final(order):
-        tracker, last = DiverTracker(config), {}
-        for index in order:
-            made = tracker.process(measurements[index])
-            last.update((item.stamp_ns, item) for item in made)
-        return [last[stamp].state.tobytes() for stamp in sorted(last)]
-
-    straight = np.arange(len(measurements))
-    shuffled = straight.copy()
-    for k in range(1, len(shuffled) - 1, 3):
-        shuffled[[k, k + 1]] = shuffled[[k + 1, k]]
-    assert final(straight) == final(shuffled)
-
-
 # -- tags ----------------------------------------------------------------------------------------
 
 
@@ -167,12 +142,9 @@ def test_a_tag_without_a_number_is_as_before():
 
 def test_sensors_have_numbers_of_their_own():
     stated = {
-        'sensors': ['radar', 'lidar'],
-        'radar.fix_std': 4,
-        'lidar.fix_std': 0.5,
-        'radar.detection_probability': 0.5,
-        'radar.clutter_density': 1e-3,
-    }
+        'sensors': ['radar', 'lidar'], 'radar.fix_std': 4, 'lidar.fix_std': 0.5,
+        'radar.detection_probability': 0.5, 'radar.clutter_density': 1e-3,
+    }  # fmt: skip
     config = DiverConfig.from_mapping(stated)
     assert stated.items() <= config.as_dict().items()
     assert DiverConfig.from_mapping(config.as_dict()) == config

@@ -9,6 +9,7 @@
 """Latitude and longitude, and positions relative to a vessel, as the tracker places them."""
 
 from attrs import evolve
+from helpers.diver_runs import run, SECOND
 import numpy as np
 import pymap3d
 import pytest
@@ -25,7 +26,6 @@ from sonar_imm.measurements import (
 )
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
-SECOND = 10**9
 ORIGIN = Origin(59.0, 10.0)
 
 
@@ -41,22 +41,13 @@ def geodetic(second, enu, cls=GeodeticFix, origin=ORIGIN, **values):
 
 def pose(second, position, yaw, frame_id='odom', **values):
     return VesselPose(
-        stamp_ns=round(second * SECOND),
-        position=position,
-        orientation=(0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)),
-        frame_id=frame_id,
-        **values,
-    )
+        stamp_ns=round(second * SECOND), position=position,
+        orientation=(0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)), frame_id=frame_id, **values,
+    )  # fmt: skip
 
 
 def relative(second, offset, **values):
     return RelativeFix(stamp_ns=round(second * SECOND), offset=offset, **values)
-
-
-def run(tracker, measurements):
-    made = [item for measurement in measurements for item in tracker.process(measurement)]
-    final = {item.stamp_ns: item for item in made}
-    return [final[stamp] for stamp in sorted(final)]
 
 
 # -- latitude and longitude ----------------------------------------------------------------------
@@ -388,8 +379,7 @@ def test_relative_positions_far_from_the_origin_are_exact_up_to_88_degrees(latit
 
 @pytest.mark.parametrize('levelled', [False, True])
 def test_magnetic_north_is_turned_to_true_north(levelled):
-    """Magnetic north lies 20 degrees east of true north: what a compass shows as due north is at
-    20 degrees clockwise."""
+    """20 degrees east of it: what a compass shows as due north is at 20 degrees clockwise."""
     stated = {'origin': (70.0, 10.0, 0.0), **EXACT}
     config = DiverConfig(magnetic_declination_deg=20.0, **stated)
     ahead = (0.0, 500.0, 0.0) if levelled else (500.0, 0.0, 0.0)
@@ -412,12 +402,9 @@ def test_covariances_turn_with_the_axes():
     tracker = DiverTracker(config)
     for second in (1, 2):
         where = VesselFix(
-            stamp_ns=second * SECOND,
-            latitude=88.0,
-            longitude=91.0,
-            height=0.0,
+            stamp_ns=second * SECOND, latitude=88.0, longitude=91.0, height=0.0,
             covariance=np.diag([1e-4, 1e-4, 1e-4]),
-        )
+        )  # fmt: skip
         heading = VesselHeading(stamp_ns=second * SECOND, orientation=towards_north(0.0))
         run(tracker, [where, heading])
     spread = np.diag([25.0, 1.0, 1.0])

@@ -25,14 +25,9 @@ def single(second, place, target, rng, std=STD):
     at = np.append(place, 0.0)[None]
     path = 2.0 * np.linalg.norm(np.append(target, 0.0) - at) + 2.0 * std * rng.normal()
     return arrivals(
-        round(second * SECOND),
-        at,
-        np.array([path / 1500.0]),
-        tx_id=np.ones(1),
-        rx_id=np.zeros(1),
-        tx=at,
-        var_toa=(2.0 * std / 1500.0) ** 2,
-    )
+        round(second * SECOND), at, np.array([path / 1500.0]), tx_id=np.ones(1), rx_id=np.zeros(1),
+        tx=at, var_toa=(2.0 * std / 1500.0) ** 2,
+    )  # fmt: skip
 
 
 def swim(place_of, steps, seed=1, swum=SWUM, **config):

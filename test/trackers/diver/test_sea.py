@@ -13,7 +13,6 @@ from helpers.diver_runs import fix
 import numpy as np
 import pytest
 
-from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.models import build_models
@@ -230,15 +229,9 @@ def test_without_anything_stated_no_state_is_added():
     assert known.memory['instruments'] == Instruments()
 
 
-def test_depths_that_do_not_fit_are_refused():
-    with pytest.raises(ConfigError, match='depth_min'):
-        DiverConfig.from_mapping({'depth_min': 30.0})
-
-
 @pytest.mark.parametrize('options', [{'sound_speed_std': 15.0}, OFF])
 def test_a_fix_before_any_ping_begins_a_track(options) -> None:
-    """Instruments that are off have their place in the state before a ping is heard; `warm` needs
-    it at every start."""
+    """Instruments have their place in the state before a ping; `warm` needs it at every start."""
     tracker = DiverTracker(DiverConfig(**options))
     tracker.warm()
     (estimate,) = tracker.process(fix(1.0, 3.0, 4.0))

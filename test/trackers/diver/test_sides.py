@@ -33,14 +33,9 @@ def ranges(second, position, rng, count, std=0.5):
     rx[:, :2] = rx[:, :2] @ TURNED.T
     path = 2.0 * np.linalg.norm(np.append(position, 0.0) - rx, axis=1)
     return arrivals(
-        round(second * SECOND),
-        rx,
-        (path + 2.0 * std * rng.normal(size=count)) / 1500.0,
-        tx_id=np.arange(count) + 1,
-        tx=rx,
-        var_toa=(2.0 * std / 1500.0) ** 2,
-        var_bearing=0.01,
-    )
+        round(second * SECOND), rx, (path + 2.0 * std * rng.normal(size=count)) / 1500.0,
+        tx_id=np.arange(count) + 1, tx=rx, var_toa=(2.0 * std / 1500.0) ** 2, var_bearing=0.01,
+    )  # fmt: skip
 
 
 def positions(steps, start=(-25.0, 30.0), velocity=(0.6, 0.2)):
@@ -82,8 +77,7 @@ def test_the_image_is_that_of_an_independent_prototype():
 @pytest.mark.parametrize('model_set', ['families', 'heading_speed'])
 @pytest.mark.parametrize('angle', [0.0, 0.3, 2.0])
 def test_the_image_of_an_image_of_a_line_along_a_heading_is_the_row_itself(model_set, angle):
-    """Along a heading of the models every image is a model. Else it lies between two: position and
-    mean speed stay, and the weights of the families do."""
+    """Else it lies between two models: position, mean speed and weights of families stay."""
     config = DiverConfig(model_set=model_set, covariance_scales=(1.0,), dimensions=3)
     models = build_models(config)
     layout = layout_of(evolve(config, receiver_position_std=1.0), models)
@@ -163,8 +157,7 @@ def test_a_third_receiver_or_a_bearing_or_a_fix_decides():
 
 
 def test_who_crosses_the_line_is_in_doubt_again():
-    """Decided by a third receiver, then alone with two: far from the line the side stays known, on
-    the line it is not."""
+    """Decided by a third receiver, then with two: far from the line it stays known."""
     rng, tracker = np.random.default_rng(5), DiverTracker(DiverConfig(max_tracks=1))
     path = positions(60, start=(-20.0, 15.0), velocity=(0.3, -0.6))
     known = []

@@ -27,46 +27,21 @@ SMALL = {**scenario('small').instruments(), 'particles': 2000}
 @pytest.fixture(scope='module')
 def pressure_scene():
     changes = {
-        'records': 1,
-        'record_seconds': 9.8,
-        'phones': 12,
-        'element_spacing': 0.18,
-        'frequency_max': 2000.0,
-        'steps_per_sigma': 0.0,
-        'block_seconds': 0.7,
-        'array_depth': 73.5,
+        'records': 1, 'record_seconds': 9.8, 'phones': 12, 'element_spacing': 0.18,
+        'frequency_max': 2000.0, 'steps_per_sigma': 0.0, 'block_seconds': 0.7, 'array_depth': 73.5,
         'first_depth': 130.0,
-    }
+    }  # fmt: skip
     return simulate(scenario('pressure', changes), 1)
 
 
 PRESSURE = {
-    'phones': 12,
-    'frequency_max': 2000.0,
-    'snapshot_seconds': 0.7,
-    'record_seconds': 9.8,
-    'depth_min': 122.0,
-    'depth_max': 172.0,
-    'particles': 500,
-}
+    'phones': 12, 'frequency_max': 2000.0, 'snapshot_seconds': 0.7, 'record_seconds': 9.8,
+    'depth_min': 122.0, 'depth_max': 172.0, 'particles': 500,
+}  # fmt: skip
 
 
-def blocks(scene, size=None):
-    """The scene's pressure, as it is or in blocks of `size` samples."""
-    own = [each.measurement for each in scene.measurements]
-    if size is None:
-        return own
-    p = np.concatenate([each.pressure for each in own])
-    return [
-        Pressure(
-            stamp_ns=own[0].stamp_ns + round(first / own[0].sample_rate * 1e9),
-            frame_id=own[0].frame_id,
-            pressure=p[first : first + size],
-            sample_rate=own[0].sample_rate,
-            reference_depth=own[0].reference_depth,
-        )
-        for first in range(0, len(p) - 1, size)
-    ]
+def blocks(scene):
+    return [each.measurement for each in scene.measurements]
 
 
 def test_pressure_gives_what_its_cross_spectra_give(pressure_scene):
@@ -86,12 +61,9 @@ def test_pressure_gives_what_its_cross_spectra_give(pressure_scene):
     frequency = np.arange(n // 2 + 1) / 0.7
     band = (frequency >= 50.0) & (frequency < 2000.001)
     spectra = CrossSpectra(
-        stamp_ns=estimate.stamp_ns,
-        frame_id='array',
-        frequency=frequency[band].astype(np.float32),
-        csdm=R[band].astype(np.complex64),
-        reference_depth=own[0].reference_depth,
-    )
+        stamp_ns=estimate.stamp_ns, frame_id='array', frequency=frequency[band].astype(np.float32),
+        csdm=R[band].astype(np.complex64), reference_depth=own[0].reference_depth,
+    )  # fmt: skip
     other, same = run([spectra], **PRESSURE)
     scale = tracker.response.sigma[0]
     assert np.abs(other.response.amplitude - tracker.response.amplitude).max() < 0.01 * scale
@@ -120,13 +92,6 @@ def test_the_noise_is_measured_right_though_it_fades_with_depth():
         tracker, _ = run(noise, particles=50, **options)
         seen.append(tracker.response.amplitude / tracker.response.sigma)
     assert np.sqrt(np.mean(np.square(seen))) == pytest.approx(1.0, abs=0.06)
-
-
-@pytest.mark.parametrize('size', [977, 50_000])
-def test_blocks_of_any_length_give_the_same(pressure_scene, size):
-    own, _ = run(blocks(pressure_scene), **PRESSURE)
-    other, _ = run(blocks(pressure_scene, size), **PRESSURE)
-    assert np.allclose(own.response.amplitude, other.response.amplitude, atol=1e-7)
 
 
 def test_a_lost_block_is_counted_and_a_long_gap_begins_anew(pressure_scene):

@@ -63,8 +63,7 @@ def test_the_floor_is_followed_under_one_identity(scene):
 
 
 def test_a_faint_floor_is_not_lost_to_what_scatters_below_it(scene):
-    """A soft floor, a third of the loudest, 5 m above where the scatter begins: by the rule that
-    scatter begins with the first reflector it has no place."""
+    """A soft floor, a third of the loudest, 5 m above where the scatter begins."""
     faint = []
     for each, true in zip(scene.measurements[:25], scene.truth):
         trace = each.measurement

@@ -60,12 +60,9 @@ def rms(x):
 
 def test_layers_are_followed_although_the_array_heaves(scene):
     _, found = run(
-        scene.traces(),
-        particles=3000,
-        heave='independent',
-        array_depth_std=0.5,
+        scene.traces(), particles=3000, heave='independent', array_depth_std=0.5,
         sound_speed_std=0.0,
-    )
+    )  # fmt: skip
     score = score_scene(found, scene, after=20)
     common, relative, heave, stated = errors(found, scene, after=20)
     assert score.right >= 0.95 and score.ospa <= 0.18
@@ -103,8 +100,7 @@ WINDOW = {'depth_min': 42.5, 'depth_max': 69.0, 'depth_step': 1 / 64}
 
 
 def kalman(seen, layers, depth_std, std, memory):
-    """Mean and standard deviation (T, 2) of the shift whose sum with the mean depth of the layers
-    is `seen` (T,); nothing is known of that depth at first."""
+    """Mean and sd (T, 2) of the shift whose sum with the mean depth is `seen` (T,)."""
     mean, P, found = np.array([seen[0], 0.0]), np.diag([1e6, std**2]), []
     F, Q = np.diag([1.0, memory]), np.diag([depth_std**2 / layers, std**2 * (1.0 - memory**2)])
     for k, y in enumerate(seen):
@@ -120,9 +116,7 @@ def kalman(seen, layers, depth_std, std, memory):
 @pytest.mark.parametrize('heave', ['independent', 'memory'])
 @pytest.mark.parametrize(('seed', 'depth_std'), [(1, 0.1), (2, 0.3)])
 def test_the_heave_is_known_as_a_kalman_filter_knows_it(scene, heave, seed, depth_std):
-    """Where the layers lie in the records is plain to see. What that says of heave and depths,
-    which no record tells apart, is then a matter of two Gaussian numbers. A filter whose particles
-    all descend from the one that explains the first record best is sure of that one's heave."""
+    """Two Gaussian numbers, heave and depth, which no record tells apart."""
     traces, wrong = scene_with(scene, heave, seed)
     options = {'heave': heave, 'array_depth_std': 0.5, 'depth_std': depth_std, **WINDOW}
     _, found = run(traces, particles=3000, seed=seed, **options)
@@ -152,8 +146,7 @@ def known_later(seen, layers, depth_std, std, memory, lag):
 
 @pytest.mark.parametrize(('heave', 'lag'), [('independent', 5), ('memory', 2)])
 def test_the_heave_of_revised_records_is_known_as_what_came_later_tells(scene, heave, lag):
-    """The offset that depths and shifts share, as the newest record knows it, not as the revised
-    one did, which would state twice the error at first."""
+    """The offset is known as the newest record knows it, not as the revised one did."""
     traces, wrong = scene_with(scene, heave, 1)
     options = {'heave': heave, 'array_depth_std': 0.5, 'smoothing_lag': lag, **WINDOW}
     _, found = run(traces, particles=3000, seed=1, **options)

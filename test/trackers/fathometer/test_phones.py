@@ -17,12 +17,9 @@ from sonar_imm.acoustics.ambient import sample_csdm
 from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 SCENE = {
-    'level': 'csdm',
-    'records': 6,
-    'snapshots': 100,
-    'snapshot_seconds': 0.2,
+    'level': 'csdm', 'records': 6, 'snapshots': 100, 'snapshot_seconds': 0.2,
     'first_amplitude': 0.35,
-}
+}  # fmt: skip
 FOUND = {'particles': 2000, 'depth_min': 42.0, 'depth_max': 74.0}
 
 

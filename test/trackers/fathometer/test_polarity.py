@@ -51,15 +51,9 @@ def test_the_filter_agrees_with_the_sum_over_all_sets_of_one():
     switch = np.array([[0.7, 0.3], [0.2, 0.8]])
     walk = np.array([0.25, 0.5, 0.25])
     model = SetModel(
-        cells=n,
-        separation=2,
-        order_min=0,
-        transition=switch,
-        walk=walk,
-        gram=np.exp(-0.5 * np.arange(n) ** 2.0),
-        amplitude_std=std,
-        negative_probability=prior,
-    )
+        cells=n, separation=2, order_min=0, transition=switch, walk=walk,
+        gram=np.exp(-0.5 * np.arange(n) ** 2.0), amplitude_std=std, negative_probability=prior,
+    )  # fmt: skip
     rng = np.random.default_rng(3)
     b = rng.standard_normal((3, n))
     b[:, 4] -= 3.5

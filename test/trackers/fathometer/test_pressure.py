@@ -35,13 +35,9 @@ from sonar_imm_tools.simulation.fathometer.simulator import scenario
 
 VECTORS = Path(__file__).parents[2] / 'vectors'
 SHORT = {
-    'phones': 6,
-    'frequency_max': 900.0,
-    'record_seconds': 4.0,
-    'depth_min': 85.0,
-    'depth_max': 100.0,
-    'particles': 100,
-}
+    'phones': 6, 'frequency_max': 900.0, 'record_seconds': 4.0, 'depth_min': 85.0,
+    'depth_max': 100.0, 'particles': 100,
+}  # fmt: skip
 
 
 def noise(seconds, *, rate=2000.0, phones=6, depths=None, block=0.5, start=10**18, seed=0):
@@ -288,12 +284,9 @@ def test_the_model_of_the_scene_is_that_of_the_vectors_and_its_draw_scatters_as_
     config = scenario('pressure', {'record_seconds': float(vectors['record_seconds'])})
     amplitude = vectors['reflector_amplitude']
     floor = Drift(
-        vectors['reflector_depth'],
-        amplitude,
-        amplitude > 0.0,
-        vectors['array_depth_true'],
+        vectors['reflector_depth'], amplitude, amplitude > 0.0, vectors['array_depth_true'],
         vectors['array_depth'],
-    )
+    )  # fmt: skip
     expected = vectors['csdm_expected'][record]
     ours = expected_csdm(config, floor, record, vectors['csdm_frequency'])
     power = np.sqrt(np.einsum('fii->fi', expected).real)

@@ -153,13 +153,10 @@ def test_a_reflector_is_waited_for_as_many_records_as_is_told():
 def members(count):
     """Reflectors far apart, as the particles know them: in cells and units of the noise."""
     return Members(
-        place=20.0 * np.arange(1, count + 1),
-        amplitude=np.full(count, 5.0),
+        place=20.0 * np.arange(1, count + 1), amplitude=np.full(count, 5.0),
         covariance=np.tile([[0.25, 0.125], [0.125, 4.0]], (count, 1, 1)),
-        prior_variance=np.full(count, 9.0),
-        foremost=np.ones(count),
-        existence=np.ones(count),
-    )
+        prior_variance=np.full(count, 9.0), foremost=np.ones(count), existence=np.ones(count),
+    )  # fmt: skip
 
 
 def test_members_of_sets_become_metres_and_amplitudes_with_what_is_not_known_of_them():

@@ -38,13 +38,10 @@ def traces(vectors, records, given=True):
     for k in records:
         sigma = np.full(len(vectors['depth']), vectors['sigma'][k])
         yield Trace(
-            stamp_ns=(k + 1) * RECORD_NS,
-            frame_id='array',
-            depth=vectors['depth'],
-            amplitude=vectors['amplitude'][k],
-            sigma=sigma if given else None,
+            stamp_ns=(k + 1) * RECORD_NS, frame_id='array', depth=vectors['depth'],
+            amplitude=vectors['amplitude'][k], sigma=sigma if given else None,
             reference_depth=float(vectors['reference_depth'][k]),
-        )
+        )  # fmt: skip
 
 
 def drift(seed=0, **changes):
@@ -100,8 +97,7 @@ def depth_nees(found, true_depths):
 
 @pytest.mark.statistics
 def test_the_uncertainty_of_depths_covers_the_depth_sensor(vectors):
-    """All reflectors of a record share the error of the array's depth, 0.03 m in the vectors and
-    the scenes, and it is greater than what the trace leaves open."""
+    """All reflectors of a record share the error of the array's depth, 0.03 m here."""
     options = {'particles': 3000, 'sound_speed_std': 0.0}
     depth, present = vectors['reflector_depth'], vectors['present']
     true = {(k + 1) * RECORD_NS: depth[k][present[k]] for k in range(300)}
@@ -124,8 +120,7 @@ def test_a_perfect_depth_sensor_needs_no_allowance():
 @pytest.mark.statistics
 @pytest.mark.parametrize('memory', [0.0, 0.98])
 def test_the_uncertainty_of_amplitudes_is_that_of_their_errors(memory):
-    """A scene of known level: amplitudes change by a twentieth from record to record. What an
-    amplitude was before makes its variance smaller by a fourth."""
+    """A memory of amplitudes makes their variance smaller by a fourth."""
     measured, truth = drift(1)
     _, found = run(measured, particles=3000, amplitude_memory=memory)
     error, variance = [], []
@@ -189,8 +184,7 @@ def test_columns_are_those_of_the_contract(vectors):
 
 
 def test_amplitudes_are_freed_of_spreading(vectors):
-    """The truth's amplitudes differ from the response's by the way the echo goes, and one factor
-    of the processor."""
+    """The truth's differ by the way the echo goes, and one factor of the processor."""
     _, found = run(traces(vectors, range(60)), particles=1000)
     raw, freed = [], []
     for stamp, each in found.items():

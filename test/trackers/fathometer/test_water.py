@@ -194,8 +194,7 @@ CUT = {'pulse': 'gaussian', 'noise_sigma': 0.05, 'min_separation': 1.5, 'depth_s
 
 
 def test_below_a_floor_that_the_window_cuts_nothing_is_the_floor():
-    """Far below a transmitter what is loud at the first depth is no transmit pulse. How deep the
-    floor is nobody can tell."""
+    """Loud at the first depth is no transmit pulse here; how deep the floor is nobody can tell."""
     tracker, found = run(cut_line(12.0), **CUT)
     for columns in found[5:]:
         assert columns['depth'][0] == pytest.approx(12.0) and columns['is_bottom'][0] > 0.9

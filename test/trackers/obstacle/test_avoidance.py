@@ -11,7 +11,7 @@
 from pathlib import Path
 
 from helpers.obstacle_runs import EXACT
-from helpers.obstacle_sea import column, encounter, ENCOUNTERS, track
+from helpers.obstacle_sea import column, ENCOUNTERS, tracked
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -120,12 +120,10 @@ def test_the_course_is_as_sure_as_its_default_says():
 
 
 def test_the_tracker_says_what_an_independent_one_does():
-    """At the pings for which it told, with its `course_std` and navigation without errors that
-    last; its course is made a little differently."""
+    """With its `course_std` and navigation without errors that last."""
     off = {'cpa_distance': [], 'cpa_time': [], 'collision_probability': []}
     for name, number in ENCOUNTERS:
-        data = encounter(name, number)
-        estimates = track(data, course_std=0.05, **EXACT)
+        data, estimates = tracked(name, number, course_std=0.05, **EXACT)
         given = np.flatnonzero(np.isfinite(data['ref_collision']))
         for key, reference in zip(off, ('cpa_distance', 'cpa_time', 'collision')):
             off[key].extend(column(estimates, key, given) - data[f'ref_{reference}'][given])

@@ -65,26 +65,8 @@ def test_movers_are_followed_through_clutter():
     assert tracks <= obstacles + 3
 
 
-def test_movers_that_cross_keep_their_tracks():
-    """Two obstacles pass each other before the sonar, 2 m apart in range."""
-    from helpers.obstacle_crossing import crossing
-
-    estimates, true = crossing()
-    ids = [
-        set(estimate.extras['track_id'][estimate.extras['track_state'] > 0])
-        for estimate in estimates[12:]
-    ]
-    assert all(item == ids[0] and len(item) == 2 for item in ids)
-    for row in range(2):
-        before, after = estimates[30], estimates[-1]
-        assert np.sign(before.extras['vy'][row]) == np.sign(after.extras['vy'][row])
-        stated = [after.extras['vx'][row], after.extras['vy'][row]]
-        assert min(np.linalg.norm(np.array(stated) - item) for item in true) < 0.1
-
-
 def test_crossing_in_clutter_while_another_is_born():
-    """Nothing is given: echoes are missed, three in a ping are false, and a third obstacle comes
-    into view when the two pass each other."""
+    """Echoes are missed, three in a ping are false, a third obstacle comes into view."""
     from helpers.obstacle_crossing import crossing
 
     estimates, true = crossing(detected=0.9, clutter=3.0, late=30)

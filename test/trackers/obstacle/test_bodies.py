@@ -96,18 +96,11 @@ def test_the_centre_of_a_body_lies_beside_its_echoes():
 def view_of(state, place):
     nothing = np.zeros((1, 1))
     return View(
-        state=state[None],
-        covariance=np.zeros((1, 3, 3)),
-        low=nothing[0],
-        high=nothing[0],
-        above=nothing[0],
-        place=place[None],
-        place_covariance=np.zeros((1, 3, 3)),
-        behaviour=nothing,
-        velocity=np.zeros((1, 2)),
-        velocity_covariance=np.zeros((1, 2, 2)),
+        state=state[None], covariance=np.zeros((1, 3, 3)), low=nothing[0], high=nothing[0],
+        above=nothing[0], place=place[None], place_covariance=np.zeros((1, 3, 3)),
+        behaviour=nothing, velocity=np.zeros((1, 2)), velocity_covariance=np.zeros((1, 2, 2)),
         near=(np.zeros((1, 1, 5)), np.zeros((1, 1, 5, 5))),
-    )
+    )  # fmt: skip
 
 
 def test_a_track_that_was_missed_keeps_its_size():
@@ -118,15 +111,10 @@ def test_a_track_that_was_missed_keeps_its_size():
         n = len(echoes)
         tracker.process(
             Detections(
-                stamp_ns=stamp,
-                range=echoes,
-                bearing=[0.1] * n,
-                var_range=[0.01] * n,
-                var_bearing=[1e-5] * n,
-                extent_range=[0.1] * n,
-                extent_bearing=[0.003] * n,
+                stamp_ns=stamp, range=echoes, bearing=[0.1] * n, var_range=[0.01] * n,
+                var_bearing=[1e-5] * n, extent_range=[0.1] * n, extent_bearing=[0.003] * n,
             )
-        )
+        )  # fmt: skip
         number = tracker._stream.state.known.obstacles.bodies.number
         assert number.tolist() == [[], [2.0], [2.0], [3.0]][k]
 
@@ -151,21 +139,14 @@ def image_run(setting, seed):
 
 @pytest.mark.statistics
 def test_tracks_of_images_are_as_good_as_they_say():
-    """Floats of half a metre in images of a small sonar, 24 scenes. Each image says how far glints
-    are apart, which does not tell how far the centroid is off: taken at its word the whole-state
-    NEES of these scenes is several times what it should be."""
+    """24 scenes: how far glints are apart does not tell how far the centroid is off."""
     setting = scenario(
         'images',
         {
-            'image_beams': 96,
-            'image_bins': 192,
-            'max_range': 32.0,
-            'first_range': 30.0,
-            'last_range': 15.0,
-            'passing_distance': 3.0,
-            'vertical_offset': 1.5,
+            'image_beams': 96, 'image_bins': 192, 'max_range': 32.0, 'first_range': 30.0,
+            'last_range': 15.0, 'passing_distance': 3.0, 'vertical_offset': 1.5,
         },
-    )
+    )  # fmt: skip
     runs = np.array([image_run(setting, seed) for seed in range(24)])
     range_, bearing, offset, state, cover = runs.mean(axis=0)
     assert 0.4 < state < 1.5

@@ -153,8 +153,7 @@ def test_the_parts_of_a_component_are_those_of_a_normal_distribution():
 
 
 def test_misses_leave_what_may_lie_outside_the_beam():
-    """Half of a component has left the beam: as probable as the whole was, the prior of the
-    other half apart, it is still there after any number of misses."""
+    """Half of a component has left the beam: it is still there after any number of misses."""
     mu, V = np.ones((1, 1)), np.array([[[0.99, 0.99, 0.5, 0.0, 0.0]]])
     existence = Existence.of(0.9 * PRIOR[None], 1)
     for _ in range(40):

@@ -9,8 +9,6 @@
 """The detector of images: an independent image, its parameters, sweeps of a scanning sonar."""
 
 from pathlib import Path
-import subprocess
-import sys
 
 from attrs import evolve
 import numpy as np
@@ -62,8 +60,7 @@ def test_five_targets_are_five_clusters_where_they_are():
 
 
 def test_the_answers_are_those_of_an_independent_detector():
-    """Where a target is one cluster of both; the chain is not, of which the study's has one
-    glint."""
+    """Where a target is one cluster of both; of the chain the study's has one glint."""
     picture, study = study_image()
     found = detect(picture, DetectorConfig())
     for r, b, db in zip(study['ref_range'], study['ref_bearing'], study['ref_snr_db']):
@@ -173,14 +170,9 @@ def beams(angles, start_ns=10**9, step_ns=10**8, target=(0.1, 20.0), rows=100, *
         off = np.hypot((angle - target[0]) / (2.0 * STEP), (r - target[1]) / 0.5)
         amplitude += 150.0 * np.exp(-np.square(off))
         yield SonarImage(
-            stamp_ns=start_ns + k * step_ns,
-            range=r,
-            bearing=[angle],
-            amplitude=amplitude[:, None],
-            frame_id='sonar',
-            scanning=True,
-            **changes,
-        )
+            stamp_ns=start_ns + k * step_ns, range=r, bearing=[angle],
+            amplitude=amplitude[:, None], frame_id='sonar', scanning=True, **changes,
+        )  # fmt: skip
 
 
 def sweeps(images, **parameters):
@@ -229,22 +221,6 @@ def test_a_sweep_ends_where_it_does_not_go_on(spoil):
     answers = [detector.process(item) for item in first + more]
     assert sum(answer is not None for answer in answers) == 1
     assert answers[len(first)] is not None
-
-
-def test_an_image_needs_no_compiler():
-    program = """
-import sys
-import numpy as np
-from sonar_imm.measurements import SonarImage
-from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
-amplitude = np.random.default_rng(0).exponential(size=(60, 40))
-amplitude[30, 20] = 1e3
-place = {'range': 1.0 + np.arange(60.0), 'bearing': np.linspace(0.3, -0.3, 40)}
-print(len(detect(SonarImage(stamp_ns=1, amplitude=amplitude, **place), DetectorConfig())))
-print('numba' in sys.modules)
-"""
-    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
-    assert done.stdout.split() == ['1', 'False'], done.stderr
 
 
 def test_memory_is_bounded_whatever_comes():

@@ -29,18 +29,12 @@ from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 STD = np.array([0.15, np.radians(0.25), np.radians(1.0)])
 IDEAL = {
-    'ideal_navigation': True,
-    'sound_speed_error': 0.0,
-    'range_step': 0.0,
-    'bearing_step_deg': 0.0,
-}
+    'ideal_navigation': True, 'sound_speed_error': 0.0, 'range_step': 0.0, 'bearing_step_deg': 0.0,
+}  # fmt: skip
 FAITHFUL = {
-    'scale_std': 0.0,
-    'navigation_noise': (0.0, 0.0, 0.0),
-    'range_scale_std': 0.0,
-    'range_std': 0.15,
-    'bearing_std_deg': 0.25,
-}
+    'scale_std': 0.0, 'navigation_noise': (0.0, 0.0, 0.0), 'range_scale_std': 0.0,
+    'range_std': 0.15, 'bearing_std_deg': 0.25,
+}  # fmt: skip
 POSE = geometry.Pose(np.array([3.0, -2.0, 20.0]), geometry.rotation(0.05, -0.08, 0.7))
 
 

@@ -12,7 +12,6 @@
 from typing import NamedTuple
 
 from attrs import evolve
-from helpers.estimates import same
 from helpers.tracked import resumed
 import numpy as np
 import pytest
@@ -208,20 +207,23 @@ def test_a_landmark_that_is_not_there_any_more_goes():
     assert tracker.landmarks == () and tracker.known() == []
 
 
-def remembered():
-    """A tracker with landmarks, and what was left to hear."""
+@pytest.fixture(scope='module')
+def half(tmp_path_factory):
+    """A tracker with landmarks, which stays as it is, one that goes on from its file, and what was
+    left to hear."""
     measurements, pings = survey(OBSTACLES, 11)
     middle = pings[len(pings) // 2].stamp_ns
     tracker = tracker_of()
     for measurement in measurements:
         if measurement.stamp_ns < middle:
             tracker.process(measurement)
-    assert tracker.landmarks
-    return tracker, [each for each in measurements if each.stamp_ns >= middle]
+    again = resumed(tmp_path_factory.mktemp('memory') / 'state', tracker, 'obstacle')
+    assert again.landmarks and again.known() == tracker.known()
+    return tracker, again, [each for each in measurements if each.stamp_ns >= middle]
 
 
-def test_the_oldest_and_least_certain_landmarks_are_given_up_first():
-    mark = remembered()[0].landmarks[0]
+def test_the_oldest_and_least_certain_landmarks_are_given_up_first(half):
+    mark = half[0].landmarks[0]
     config = ObstacleConfig(max_landmarks=2, landmark_time=1000.0)
     hour = 3600 * SECOND
     there = [(0, 0.9999), (hour, 0.7), (hour, 0.8), (hour // 2, 0.9999)]
@@ -237,21 +239,9 @@ def test_the_oldest_and_least_certain_landmarks_are_given_up_first():
     np.testing.assert_allclose(np.sqrt(np.diag(drifted)), 0.6)  # .01 m/sqrt(s) for an hour
 
 
-def test_landmarks_are_saved_with_the_state(tmp_path):
-    tracker, rest = remembered()
-    again = resumed(tmp_path / 'state', tracker, 'obstacle')
-    assert [each.track_id for each in again.landmarks] == [
-        each.track_id for each in tracker.landmarks
-    ]
-    for measurement in rest:
-        ours, theirs = tracker.process(measurement), again.process(measurement)
-        assert len(ours) == len(theirs) and all(map(same, ours, theirs))
-    assert again.known() == tracker.known()
-
-
-def test_landmarks_outlive_a_silence_but_not_a_clock_that_goes_back():
+def test_landmarks_outlive_a_silence_but_not_a_clock_that_goes_back(half):
     """What is in view when the clock jumps ahead is kept as well."""
-    tracker, rest = remembered()
+    _, tracker, rest = half
     known = {row['track_id'] for row in tracker.known()}
     for measurement in rest[:300]:
         tracker.process(evolve(measurement, stamp_ns=measurement.stamp_ns + 7200 * SECOND))
@@ -293,13 +283,13 @@ def test_what_moves_is_no_landmark():
 
 
 def test_late_pings_change_what_is_remembered_as_in_order():
-    measurements, _ = survey(OBSTACLES, 5, passes=2)
+    measurements, _ = survey(OBSTACLES, 5, passes=1)
     rng = np.random.default_rng(1)
     delay = rng.uniform(0.0, 2.0, len(measurements)) * SECOND
     arrival = np.array([each.stamp_ns for each in measurements]) + delay
     in_order, shuffled = tracker_of(), tracker_of()
-    for k in range(len(measurements)):
-        in_order.process(measurements[k])
+    for measurement in measurements:
+        in_order.process(measurement)
     for k in np.argsort(arrival, kind='stable'):
         shuffled.process(measurements[k])
     assert in_order.known() and shuffled.known() == in_order.known()

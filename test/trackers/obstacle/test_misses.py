@@ -30,12 +30,9 @@ from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, Tr
 
 P_D = 0.9
 STILL = {
-    'scale_std': 0.0,
-    'navigation_noise': (0.0, 0.0, 0.0),
-    'drift_std': 0.0,
-    'yaw_error_std_deg': 0.0,
-    'navigation_delay_std': 0.0,
-}
+    'scale_std': 0.0, 'navigation_noise': (0.0, 0.0, 0.0), 'drift_std': 0.0,
+    'yaw_error_std_deg': 0.0, 'navigation_delay_std': 0.0,
+}  # fmt: skip
 DEPTH = 20.0
 HALF = np.radians(7.5)
 R = np.diag([0.15**2, np.radians(0.25) ** 2])
@@ -82,8 +79,7 @@ class Grid:
 @pytest.mark.statistics
 @pytest.mark.parametrize('offset, echoes', [(-2.5, 18), (-1.5, 35), (4.0, 32)])
 def test_an_obstacle_is_believed_where_an_exact_grid_filter_believes_it(offset, echoes):
-    """A sonar that looks down by 3 degrees on a level path: ranges say how far off an obstacle
-    lies and nothing of the side; where it is no longer seen tells."""
+    """Looking down by 3 degrees: where it is no longer seen tells the side."""
     pitch, step = np.radians(-3.0), 0.75
     turned = geometry.rotation(0.0, pitch, 0.0)
     config = ObstacleConfig(behaviours=('fixed',), components=41, **STILL)

