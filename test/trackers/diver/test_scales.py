@@ -11,7 +11,7 @@
 from pathlib import Path
 
 from attrs import evolve
-from helpers.diver_runs import fix
+from helpers.diver_runs import fix, scan_of
 import numpy as np
 import pytest
 
@@ -97,6 +97,16 @@ def test_covariances_that_are_far_too_small_cost_nothing_and_the_factor_is_named
     factor = float(warned.removeprefix(WARNED).partition(':')[0])
     assert 0.6 < factor / excess < 1.7 and 'e+' not in warned
     assert len(tracker._stream.state.rows) <= 4
+
+
+def test_a_scale_is_found_also_beside_false_fixes():
+    """A track gets one fix of a scan at most; the others are not of it."""
+    rng, tracker = np.random.default_rng(3), DiverTracker(DiverConfig())
+    for k, place in enumerate(swim(7, count=80)[1], start=1):
+        places = np.vstack([place + rng.normal(size=2), rng.uniform(-200.0, 200.0, (2, 2))])
+        (estimate,) = tracker.process(scan_of(k, places, std=0.1))
+    firm = estimate.extras['track_state'] > 0
+    assert estimate.extras['covariance_scale'][firm].max() > 50.0
 
 
 def steer(seed, std, stated, count=60):
