@@ -32,7 +32,7 @@ import numpy as np
 
 from benchmarks.diver_families import INSIDE
 from benchmarks.study import final_estimates, Parts, study, truths
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import TrueTrack
@@ -59,6 +59,10 @@ class Score(NamedTuple):
     """(K,) squared error, m^2."""
     nees: FloatArray
     """(K,)."""
+
+    def only(self, kept: BoolArray) -> Score:
+        """The estimates `kept` (K,)."""
+        return Score(*(column[kept] for column in self))
 
 
 def path(seed: int, motion: str = 'legs', **values: Any) -> TrueTrack:
@@ -154,7 +158,7 @@ def row_of(scores: list[Score], first: int, last: int) -> dict[str, float | None
     parts = []
     for score in scores:
         inside = (score.ping >= first) & (score.ping < last)
-        parts.append(Score(*(column[inside] for column in score)))
+        parts.append(score.only(inside))
     shown = [part for part in parts if len(part.ping)]
     row: dict[str, float | None] = {'tracked': len(shown) / len(scores)}
     if not shown:
@@ -215,8 +219,7 @@ def few(kind: str, receivers: int, seeds: range) -> dict[str, float]:
         pings = thinned(seed, receivers, passive, track)
         for model_set, scores in late.items():
             score = followed(pings, track, max_tracks=1, model_set=model_set)
-            settled = score.ping >= SETTLED
-            scores.append(Score(*(column[settled] for column in score)))
+            scores.append(score.only(score.ping >= SETTLED))
     square, nees = (
         {name: np.concatenate([score[k] for score in scores]) for name, scores in late.items()}
         for k in (1, 2)

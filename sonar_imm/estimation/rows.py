@@ -85,6 +85,13 @@ class Rows:
         return _first_rows(self.target)
 
     @cached_property
+    def heaviest(self) -> IndexArray:
+        """(T,) heaviest row of each target, the first of equals."""
+        best = np.maximum.reduceat(self.logw, self.first)[self.target]
+        own = np.flatnonzero(self.logw == best)
+        return own[_first_rows(self.target[own])]
+
+    @cached_property
     def weight(self) -> FloatArray:
         """(N,) row weights, normalised for each target."""
         return self.weights_among(np.ones(len(self), np.bool_))
@@ -308,9 +315,7 @@ class Borrowed:
         """
         if not len(self):
             return np.empty(0, np.intp)
-        heaviest = np.maximum.reduceat(rows.logw, rows.first)[rows.target] == rows.logw
-        lenders, first = np.unique(rows.target[heaviest], return_index=True)
-        return np.asarray(np.flatnonzero(heaviest)[first[np.searchsorted(lenders, self.target)]])
+        return rows.heaviest[self.target]
 
 
 def drop_weightless_rows(

@@ -252,18 +252,30 @@ def _subset_ping(
         node = slice(first, last)
         now = _grow(now, estimated, height, measured, node, outlier_probability, most)
         first = last
-    starts = np.searchsorted(now.of, every)
-    best = np.maximum.reduceat(now.weight, starts)
-    share = np.exp(now.weight - best[now.of])
+    return combine(now.of, now.weight, now.x, now.P, now.good)
+
+
+def combine(
+    of: IntArray, log: FloatArray, x: FloatArray, P: FloatArray, good: np.ndarray
+) -> Updated:
+    """Return the moments of the B explanations of each hypothesis.
+
+    :param of: (B,) their hypotheses, 0 to L - 1 in rising order, each at least once.
+    :param log: (B,) log-probabilities.
+    :param x: (n, B), P: (n, n, B), good: (C, B).
+    """
+    starts = np.flatnonzero(np.diff(of, prepend=-1))
+    best = np.maximum.reduceat(log, starts)
+    share = np.exp(log - best[of])
     total = np.add.reduceat(share, starts)
-    share /= total[now.of]
-    mean = np.add.reduceat(share * now.x, starts, axis=1)
-    apart = now.x - pick(mean, now.of)
-    covariance = np.empty((len(mean), len(mean), L))
+    share /= total[of]
+    mean = np.add.reduceat(share * x, starts, axis=1)
+    apart = x - pick(mean, of)
+    covariance = np.empty((len(mean), len(mean), len(starts)))
     for a, own in enumerate(apart):
-        second = share * (now.P[a] + own * apart)
+        second = share * (P[a] + own * apart)
         covariance[a] = np.add.reduceat(second, starts, axis=1)
-    taken = np.add.reduceat(share * now.good, starts, axis=1)
+    taken = np.add.reduceat(share * good, starts, axis=1)
     return mean.T, np.moveaxis(covariance, -1, 0), best + np.log(total), taken.T
 
 

@@ -32,6 +32,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.consider import consider_scalar
 from ...estimation.covariance import JITTER, semidefinite_roots
 from .explanations import (
+    combine,
     in_parts,
     last_axis,
     pick,
@@ -361,19 +362,8 @@ def _student_t_ping(
         innovation = residual[c] + (gradient[c] * (there - means)).sum(axis=0)
         noise = wider * variance[c] / weight[c]
         consider_scalar(means, covariances, gradient[c], noise, innovation, estimated)
-    first = np.searchsorted(of, own)
-    best = np.maximum.reduceat(log, first)
-    share = np.exp(log - best[of])
-    total = np.add.reduceat(share, first)
-    share /= total[of]
-    each = means[:, : len(of)]
-    mean = np.add.reduceat(share * each, first, axis=1)
-    apart = each - pick(mean, of)
-    spread = covariances[..., len(of) :] + apart[:, None] * apart
-    evidence[known] = best + np.log(total)
-    weights[known] = np.add.reduceat(share * now.weight, first, axis=1).T
-    x1[known] = mean.T
-    P1[known] = np.moveaxis(np.add.reduceat(share * spread, first, axis=2), -1, 0)
+    each = means[:, : len(of)], covariances[..., len(of) :], now.weight
+    x1[known], P1[known], evidence[known], weights[known] = combine(of, log, *each)
     return x1, P1, evidence, weights
 
 
@@ -407,14 +397,12 @@ def _distinct(prior: _Prior, u: FloatArray) -> _Searches:
     every = every._replace(
         value=every.value + (fit - tail).sum(axis=0), weight=every.weight * good
     )
-    order = np.argsort(-every.value.reshape(-1, L), axis=0, kind='stable')
+    order = np.argsort(-every.value.reshape(-1, L), axis=0, kind='stable') * L + of
+    kept = np.zeros(order.shape, np.bool_)
     found: list[_Searches] = []
-    kept: list[BoolArray] = []
-    for row in order:
-        now = every.only(row * L + of)
-        new = np.ones(L, np.bool_)
-        if found:
-            new = now.value >= found[0].value - PRUNE
+    for new, row in zip(kept, order):
+        now = every.only(row)
+        new[:] = now.value >= (found or [now])[0].value - PRUNE
         for other, was in zip(found, kept):
             apart = now.u - other.u
             along = np.einsum('cas,as->cs', other.slope, apart)
@@ -422,7 +410,4 @@ def _distinct(prior: _Prior, u: FloatArray) -> _Searches:
             distance += (along**2 * other.weight / prior.noise).sum(axis=0)
             new &= ~was | (distance > SAME)
         found.append(now)
-        kept.append(new)
-    chosen = np.flatnonzero(np.array(kept).T.ravel())
-    together = (np.stack(part, axis=-1) for part in zip(*found))
-    return _Searches(*(part.reshape(*part.shape[:-2], -1) for part in together)).only(chosen)
+    return every.only(order.T[kept.T])

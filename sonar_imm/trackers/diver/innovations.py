@@ -145,9 +145,9 @@ class FixConsistency(NamedTuple):
 
         bias_stated: whether `fix_bias_std` is set.
         """
-        if bias_stated or self.are_too_small or self.number < 0.99 * MEMORY:
+        if bias_stated or self.are_too_small or self.hidden > 0.5:
             return False
-        if self.hidden > 0.5:
+        if self.number < 0.99 * MEMORY:
             return False
         # Large innovations that are correlated are those of a motion that no model has.
         return self.mean_nis < (1.0 if self.lag_1 > CORRELATED else PESSIMISTIC)

@@ -383,24 +383,20 @@ def with_far_scales(rows: Rows, borrowed: Borrowed, sensor: int) -> tuple[Rows, 
     Either the fixes are far more accurate than the motion, or only their covariances say so. A row
     that lends shows no difference: it took the noise of the fixes for motion.
     """
-    scale, first = rows.key['scale'][:, sensor], rows.first
-    heaviest = np.maximum.reduceat(rows.logw, first)
-    lender = np.flatnonzero(rows.logw == heaviest[rows.target])
-    is_lender = np.zeros(len(heaviest), np.bool_)
-    is_lender[rows.target[lender[rows.key['taken'][lender] == UNDECIDED]]] = True
+    scale, first, lender = rows.key['scale'][:, sensor], rows.first, rows.heaviest
     usual = (scale >= MIN_PUBLISHED_SCALE) & (scale <= USUAL_SCALES[1])
     logw = np.where(usual, rows.logw, np.nan)
     with np.errstate(invalid='ignore'):
         spread = np.fmax.reduceat(logw, first) - np.fmin.reduceat(logw, first)
     count = np.add.reduceat(usual.astype(np.int64), first)
-    undecided = is_lender & (count > 1) & (spread < np.log(2.0))
+    undecided = (rows.key['taken'][lender] == UNDECIDED) & (count > 1) & (spread < np.log(2.0))
     if not undecided.any() or not len(borrowed):
         return rows, borrowed
     far = borrowed.key['scale'][:, sensor] > USUAL_SCALES[1]
     values = borrowed.key['scale'][far, sensor].tolist()
     chosen = far & usual_assumptions(rows, borrowed, values, sensor)
     chosen &= undecided[borrowed.target]
-    least = heaviest[borrowed.target] + np.log(2.0 * ROW_AGAIN)
+    least = rows.logw[lender][borrowed.target] + np.log(2.0 * ROW_AGAIN)
     logw = np.where(chosen, np.maximum(borrowed.logw, least), borrowed.logw)
     return normalise_weights(rows, evolve(borrowed, logw=logw))
 

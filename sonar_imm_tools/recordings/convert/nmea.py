@@ -92,6 +92,8 @@ class _Log:
     unread: Counter[str] = Factory(Counter)
     hears: bool = False
     """Whether the vessel has a USBL."""
+    talkers: Counter[str] = Factory(Counter)
+    """How many sentences each talker says of the place of the receiver."""
     talker: str = ''
     """That of the vessel's positions, where several say them."""
     apart: list[float] = Factory(list)
@@ -144,7 +146,7 @@ def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None
 def _tell_receivers(log: _Log, path: Path, report: ConversionReport, chosen: str) -> None:
     """Say that a log holds positions of several receivers. Raises `BagError` where they lie apart
     and nobody has chosen."""
-    talkers = _talkers(path)
+    talkers = log.talkers
     two = len(log.apart) > 1 and float(np.median(log.apart)) > APART
     if len(talkers) > 1:
         counts = ', '.join(f'{talker} ({count})' for talker, count in talkers.most_common())
@@ -177,8 +179,8 @@ def _read(path: Path, report: ConversionReport, how: NmeaOptions) -> _Log:
         raise BagError(
             "logs of NMEA sentences need pyais and pynmea2: pip install 'sonar_imm[nmea]'"
         ) from None
-    log = _Log(_day(how.date))
     talkers = _talkers(path)
+    log = _Log(_day(how.date), talkers=talkers)
     if how.talker and how.talker not in talkers:
         raise BagError(
             f'no position in {path} is of the talker {how.talker}; there are '
