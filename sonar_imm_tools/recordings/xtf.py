@@ -75,8 +75,8 @@ def pings_of(path: Path, report: ConversionReport) -> Iterator[dict[str, Any]]:
     """The pings of a file: where (its word), stamp_ns (-1 for none), channels (dicts of side,
     name, samples, slant_range m, delay s, frequency Hz), soundings (n, 3), metres east and north
     of the place and depth below the surface, None in a ping of side scan; sound_speed m/s, place
-    (x, y) in degrees or metres as units says (empty without a place), layback m from there to the sonar, heading, pitch,
-    roll in degrees, depth, altitude m.
+    (x, y) in degrees or metres as units says, empty without a place, layback m from there to the
+    sonar, heading, pitch, roll in degrees, depth, altitude m.
 
     The report is told what ended a file early, and what was not taken. Raises `BagError` without
     pyxtf."""
