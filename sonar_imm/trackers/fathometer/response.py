@@ -270,8 +270,6 @@ def trace_response(
     quiet &= np.isfinite(trace.amplitude)
     if np.count_nonzero(quiet) < LEAST_NOISE_SAMPLES:
         quiet = np.isfinite(trace.amplitude)
-    if config.remove_background:
-        amplitude = amplitude - np.median(amplitude[quiet])
     sigma, noise_unknown = stated_sigma(trace, depth, config.noise_sigma), False
     if sigma is None:
         sigma = np.full(len(depth), measured_sigma(amplitude[quiet]))
