@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ...estimation.arrays import FloatArray
-from .grid_kernels import PingLikelihood, Track
+from .bins import PingLikelihood, Track
 from .models import TerrainModels
 from .terrain import SLOPE0
 from .terrain_kernels import filter_terrain, NODES, ROWS

@@ -352,8 +352,8 @@ def test_nothing_but_noise_is_the_start():
         ({'engine': 'particles'}, 'terrain runs on engine gaussian, not on particles'),
         ({'smoothing': 'modes'}, 'terrain smooths states, or nothing'),
         (
-            {'model_set': 'height_two_rw', 'engine': 'gaussian'},
-            'gaussian is for model_set terrain',
+            {'model_set': 'angle_two_rw', 'engine': 'gaussian'},
+            'gaussian is for terrain and height_two_rw',
         ),
     ],
 )
