@@ -52,7 +52,7 @@ from .likelihood import (
     Swath,
 )
 from .models import build_models, TerrainModels
-from .terrain_filter import run_terrain
+from .terrain_filter import bridged, run_terrain
 from .two_surfaces import EXISTS, FEWEST_STAVES, resolve, Surfaces
 
 SMOOTH, ROUGH, CANNOT_TELL = 0, 1, 2
@@ -188,8 +188,10 @@ def run(seen: Look, favour: FloatArray | None = None) -> Track:
     smooth = config.smoothing_used == 'states'
     if config.is_gaussian:
         peak = seen.swath.height_from(seen.loudest)
-        temper = 1.0 / seen.alike if config.is_terrain else 1.0
-        track = run_terrain(models, likelihood, peak, smooth=smooth, temper=temper)
+        told, temper = likelihood, 1.0
+        if config.is_terrain:
+            told, temper = bridged(likelihood), 1.0 / seen.alike
+        track = run_terrain(models, told, peak, smooth=smooth, temper=temper)
         track = _with_constants(track, likelihood)
     else:
         entropy = config.seed, seen.ping.snapshot.stamp_ns, int(seen.swath.side == 'port')
@@ -286,9 +288,10 @@ def _empty(T: int, M: int, n: int) -> Track:
 
 
 def _with_constants(track: Track, ping: PingLikelihood) -> Track:
-    """The same with log likelihoods of the samples, not only of what depends on the state."""
-    constant = np.where(ping.echo, ping.constant, 0.0)
-    return track._replace(log_likelihood=track.log_likelihood + constant)
+    """The same with log likelihoods of the samples, not only of what depends on the state; zero
+    in bins without an echo."""
+    whole = np.where(ping.echo, track.log_likelihood + ping.constant, 0.0)
+    return track._replace(log_likelihood=whole)
 
 
 def summarise(seen: Look, track: Track) -> Answer:
