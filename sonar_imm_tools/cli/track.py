@@ -120,7 +120,8 @@ def _shard(
 @click.option(
     '--parquet',
     is_flag=True,
-    help='Write the tables as Parquet in place of CSV: a fifth of the bytes; needs pyarrow.',
+    help='Write the tables as Parquet in place of CSV, a fifth of the bytes, and bins that have '
+    'soundings into the table alone; needs pyarrow.',
 )
 @click.option('--no-table', is_flag=True, help='Write no tables: the bag has all of it.')
 @click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')

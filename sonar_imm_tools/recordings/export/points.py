@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
 from attrs import frozen
 import numpy as np
@@ -74,7 +75,7 @@ def read_points(path: Path) -> Points:
         return _read_recording(path)
     wanted = ['stamp_ns', *(name for name in COLUMNS if name not in (*PLACES, *LATER))]
     if path.suffix == '.parquet':
-        return _read_parquet(path, wanted)
+        return _points_of(path, wanted)
     try:
         with path.open(encoding='utf-8', newline='') as file:
             reader = csv.reader(file)
@@ -98,16 +99,21 @@ def read_points(path: Path) -> Points:
     return _exact(stamps, columns)
 
 
-def _read_parquet(path: Path, wanted: list[str]) -> Points:
+def read_parquet(path: Path) -> Any:
+    """The table of a Parquet file, as pyarrow has it. Raises `BagError` for what is none."""
     import pyarrow
     import pyarrow.parquet
 
     try:
         with path.open('rb') as file:  # the library names only files whose names are UTF-8
-            table = pyarrow.parquet.read_table(file)
+            return pyarrow.parquet.read_table(file)
     except (OSError, pyarrow.ArrowException) as error:
         sentence = ' '.join(str(error).split())
         raise BagError(f'{path} cannot be read: {sentence}') from None
+
+
+def _points_of(path: Path, wanted: list[str]) -> Points:
+    table = read_parquet(path)
     if missing := [name for name in wanted if name not in table.column_names]:
         raise BagError(f'{path} has no column {" and ".join(missing)}')
     try:
@@ -117,7 +123,7 @@ def _read_parquet(path: Path, wanted: list[str]) -> Points:
             for name in COLUMNS
             if name in table.column_names
         }
-    except (ValueError, TypeError, OverflowError, pyarrow.ArrowException):
+    except (ValueError, TypeError, OverflowError, RuntimeError):  # as pyarrow has them too
         raise BagError(f'{path} has a column that is not numbers throughout') from None
     return _exact(stamps, columns)
 
