@@ -205,6 +205,7 @@ def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
 
 def _export_tracks(asked: _Asked) -> Told:
     """Tracks of a run of divers or obstacles."""
+    from ..evaluation.numbers import counted
     from ..recordings.export.tracks import tracks_of, write_tracks
     from ..recordings.sources import BagError, names_of_targets, TARGET_NAMES
 
@@ -223,7 +224,7 @@ def _export_tracks(asked: _Asked) -> Told:
     count = sum(1 for _ in tracks.each())
     left = f', {left_out} left out that have no place on Earth' if left_out else ''
     result = {'rows': len(tracks), 'left_out': left_out, 'tracks': count}
-    return result, f'{count} tracks, {len(tracks)} rows{left}'
+    return result, f'{counted(count, "track")}, {counted(len(tracks), "row")}{left}'
 
 
 def _export_horizons(asked: _Asked, original: Path | None) -> Told:

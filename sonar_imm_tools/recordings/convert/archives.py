@@ -47,7 +47,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     'iq': ('iq', 'snapshots', 'Y', 'quadrants'),
     'range': ('range', 'range_m', 'ranges', 'r'),
     'time': ('time', 'two_way_time'),
-    'stamp': ('stamp', 'stamps'),
+    'stamp': ('stamp', 'stamps', 'timestamp', 'timestamps'),
     'sound_speed': ('sound_speed', 'c'),
     'frequency': ('frequency', 'f0'),
     'element_spacing': ('element_spacing',),
@@ -80,6 +80,9 @@ def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionRepor
     """Convert an npz archive to the topic ``/snapshot``, one message per ping."""
     content = _Archive(path, how.names)
     samples = _samples(content, how.staves)
+    content.sort_times(*samples.shape[:2])
+    if content.get('stamp') is None:
+        report.notes['stamps'] = f'none in the archive: {how.ping_rate:g} pings per second'
     stamps = _stamps(content.path, content.get('stamp'), len(samples), how.ping_rate, 'pings')
     constants = {name: content.number(name) for name in _CONSTANTS}
     constants['element_spacing'] = _element_spacing(content, constants, report)
@@ -96,6 +99,8 @@ def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionRepor
         records.append((stamp, '/snapshot', write_snapshot(snapshot, ros_message)))
         if (profile := _true_floor(content, ping, snapshot)) is not None:
             records += records_of(profile, '')
+    if not any(topic == '/snapshot' for _, topic, _ in records):
+        records = []  # places alone are no recording
     report.note_ignored(path, content.unused)
     write_bag(report.path, records, report, source=path.name, storage=how.storage)
 
@@ -105,20 +110,34 @@ class _Archive:
 
     def __init__(self, path: str | Path, names: Mapping[str, str]):
         self.path = Path(path)
+        usual = {other: what for what, others in NAMES.items() for other in others}
+        names = {usual.get(name, name): array for name, array in names.items()}
         if unknown := [name for name in names if name not in NAMES]:
             raise BagError(f"unknown array '{unknown[0]}'; the names are {', '.join(NAMES)}")
         there = read_npz(self.path)
         wanted = {what: (names[what],) if what in names else NAMES[what] for what in NAMES}
         self._arrays: dict[str, NDArray] = {}
+        self._taken: dict[str, str] = {}
         for what, candidates in wanted.items():
             found = [name for name in candidates if name in there]
             if found:
+                self._taken[what] = found[0]
                 self._arrays[what] = numbers_of(self.path, found[0], there[found[0]])
             elif what in names:
                 raise BagError(f"{path} has no array '{names[what]}'; it has {', '.join(there)}")
         self.listed = ', '.join(there)
         taken = {name for candidates in wanted.values() for name in candidates}
         self.unused = [name for name in there if name not in taken]
+
+    def sort_times(self, pings: int, bins: int) -> None:
+        """Take times of pings for their stamps, and times beside ranges for unused."""
+        time = self.get('time')
+        if time is None:
+            return
+        if time.size == pings != bins and time.ndim == 1 and 'stamp' not in self._arrays:
+            self._arrays['stamp'] = self._arrays.pop('time')
+        elif 'range' in self._arrays:
+            self.unused.append(self._taken['time'])
 
     def get(self, what: str) -> NDArray | None:
         return self._arrays.get(what)

@@ -51,6 +51,9 @@ def convert(tmp_path):
     return run
 
 
+POSE = {'x': 1.0, 'y': 2.0, 'heading': 90.0}
+
+
 def samples(*shape):
     rng = np.random.default_rng(0)
     return (rng.normal(size=shape) + 1j * rng.normal(size=shape)).astype(np.complex64)
@@ -86,6 +89,18 @@ def test_without_stamps_pings_follow_the_rate(convert):
     _, received, _ = convert({'ping_rate': 4.0}, Y=samples(3, 10, 4), time=RANGE / 750.0)
     assert np.diff([item.stamp_ns for item in received]).tolist() == [250_000_000] * 2
     assert np.allclose(received[0].range, RANGE)
+
+
+def test_times_of_pings_are_stamps_and_times_beside_ranges_are_named(convert):
+    report, received, _ = convert(iq=samples(3, 10, 4), range=RANGE, time=[5.0, 6.5, 7.0])
+    assert [item.stamp_ns for item in received] == [5 * 10**9, 65 * 10**8, 7 * 10**9]
+    assert 'stamps' not in report.notes
+
+
+def test_times_of_samples_beside_ranges_are_not_used_and_named(convert):
+    report, _, _ = convert(iq=samples(3, 10, 4), range=RANGE, two_way_time=RANGE / 750.0)
+    assert 'two_way_time' in str(report.notes)
+    assert report.notes['stamps'] == 'none in the archive: 10 pings per second'
 
 
 def test_the_truth_of_a_test_vector(convert):
@@ -199,6 +214,7 @@ def test_bad_pings_are_left_out_and_named(convert):
          'one finite number'),
         ({'staves': [[0, 4], [1]]}, {'iq': samples(10, 4), 'range': RANGE}, 'channels 0 to 3'),
         ({'names': {'iq': 'data'}}, {'iq': samples(10, 4), 'range': RANGE}, "no array 'data'"),
+        ({}, {'iq': samples(10, 4), 'range': RANGE[:9], **POSE}, 'nothing that could be'),
         ({'names': {'data': 'iq'}}, {'iq': samples(10, 4), 'range': RANGE}, 'unknown array'),
         ({}, {'iq': np.array([{}]), 'range': RANGE}, 'more than plain arrays'),
     ],
