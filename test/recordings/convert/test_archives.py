@@ -17,9 +17,11 @@ import numpy as np
 import pytest
 
 from msg_adapters.estimates import read_estimate
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.geometry import rotation_of_quaternion
 from sonar_imm.measurements import Navigation
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.cli.track import Plan
 from sonar_imm_tools.recordings.convert import (
     convert_segy,
     convert_snapshots,
@@ -148,6 +150,16 @@ def test_places_and_attitude_of_each_ping_become_navigation(convert, poses):
         assert bow[2] == pytest.approx(math.sin(0.1))
         starboard = rotation_of_quaternion(pose.orientation) @ [0.0, -1.0, 0.0]
         assert starboard[2] == pytest.approx(-math.sin(math.radians(5.0)) * math.cos(0.1))
+
+
+def test_the_origin_of_degrees_counts_beside_other_parameters(convert, tmp_path):
+    convert(iq=samples(3, 30, 4), range=RANGES, **POSES)
+    params = tmp_path / 'my.yaml'
+    params.write_text('/**: {ros__parameters: {sonar_height: 12.0}}')
+    for chosen in (None, params):
+        (job,) = Plan(params=chosen).jobs(tmp_path / 'bag', tmp_path / 'out')
+        assert job.options.origin == Origin(59.43, 10.47)
+    assert job.config.sonar_height == 12.0
 
 
 @pytest.mark.parametrize(
