@@ -197,8 +197,8 @@ def _export_map(asked: _Asked) -> Told:
 
 
 def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
-    """Longitude and latitude (n,) of places (n, 2) in metres from the origin; None where nobody
-    says it."""
+    """Longitude and latitude (n,) of places (n, 2 or 3) in metres from the origin; None where
+    nobody says it."""
     if asked.epsg is None:
         return None
     import numpy as np
@@ -206,7 +206,7 @@ def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
     from ..recordings.export.points import degrees_of
 
     epsg, shift = asked.epsg, np.array(asked.origin[:2])
-    return lambda places: degrees_of(places + shift, epsg)
+    return lambda places: degrees_of(places[:, :2] + shift, epsg)
 
 
 def _export_tracks(asked: _Asked) -> Told:

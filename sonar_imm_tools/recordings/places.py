@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import suppress
 import math
 import re
@@ -328,7 +329,8 @@ def checked_origin(origin: tuple[float, ...] | None) -> tuple[float, float, floa
 BEARINGS = ('bow', 'north', 'east')
 """Where bearings count from: clockwise from the bow or from north, counter-clockwise from east."""
 RANGES = ('', 'slant', 'horizontal')
-_TURN = 6.3
+TURN = 6.3
+"""Radians; beyond it angles can only be degrees."""
 _LEAST, _SHARE = 1.0, 0.05
 """A depth matters where a slant range and a horizontal one differ by more: m, share of it."""
 
@@ -406,7 +408,7 @@ class PolarRows:
         distance, bearing = row.number('range'), row.number('bearing')
         if distance < 0.0:
             raise BadRow(f'{row.table.header("range")} is {distance:g}, a negative distance')
-        if abs(bearing) * self._unit > 2.0 * _TURN:
+        if abs(bearing) * self._unit > 2.0 * TURN:
             raise BadRow(f'{row.table.header("bearing")} is {bearing:g}, more than two turns')
         self._largest = max(self._largest, abs(bearing))
         slant, height = distance, row.height() if self._slant else 0.0
@@ -427,9 +429,15 @@ class PolarRows:
 
     def check_unit(self) -> None:
         """Raise `BagError` where neither the header nor the bearings say degrees or radians."""
-        header = self._table.header('bearing')
-        if not unit_of(self._table.with_unit('bearing')) and 0.0 < self._largest <= _TURN:
-            raise BagError(
-                f'{self._table.path}: {header} may be degrees or radians, none is beyond '
-                f'{self._largest:.3g}; write bearing_deg or bearing_rad in the header'
-            )
+        ask_for_angle(self._table, 'bearing', [self._largest])
+
+
+def ask_for_angle(table: Table, name: str, values: Iterable[float]) -> None:
+    """Raise `BagError` where neither the header of an angle nor its values, of which those that
+    are NaN do not count, say degrees or radians."""
+    largest = max((abs(value) for value in values if not math.isnan(value)), default=0.0)
+    if table.has(name) and not unit_of(table.with_unit(name)) and 0.0 < largest <= TURN:
+        raise BagError(
+            f'{table.path}: {table.header(name)} may be degrees or radians, none is beyond '
+            f'{largest:.3g}; write {name}_deg or {name}_rad in the header'
+        )

@@ -27,7 +27,7 @@ from sonar_imm.measurements import Rejection
 from ..conversion import ConversionReport, flags_of
 from ..conversion import Record as Stamped
 from ..csv_table import CsvTable
-from ..places import Degrees
+from ..places import ask_for_angle, Degrees, TURN
 from ..positions import write_position
 from ..sources import BagError
 from ..tables import CsvOptions, Row
@@ -41,7 +41,8 @@ ARRAYS: dict[str, tuple[str, ...]] = {
     'y': ('y', 'north', 'northing'),
     'z': ('z',),
     'depth': ('sonar_depth',),
-    'heading': ('heading', 'hdg', 'heading_deg'),
+    'heading': ('heading', 'hdg'),
+    'heading_deg': ('heading_deg',),
     'heading_rad': ('heading_rad',),
     'yaw': ('yaw', 'yaw_rad'),
     'yaw_deg': ('yaw_deg',),
@@ -87,6 +88,7 @@ def navigation_of_table(
             return {**record, 'stamp_ns': stamp_ns, 'place': place, 'depth': -height}
 
         rows = [record for _, record in report.read_rows(table, parse)]
+        ask_for_angle(table, 'heading', (row['heading'] for row in rows))
     units = 'degrees' if geodetic else 'metres'
     report.rows -= len(rows)  # those of the input are counted
     if on_earth and geodetic:
@@ -157,7 +159,14 @@ def _messages(
 
 def _heading(values: Mapping[str, NDArray], path: Path) -> NDArray:
     """Return the heading (n,), degrees clockwise from north. Raises `BagError`."""
+    if 'heading_deg' in values:
+        return values['heading_deg']
     if 'heading' in values:
+        if 0.0 < np.nanmax(np.abs(values['heading']), initial=0.0) <= TURN:
+            raise BagError(
+                f'{path}: heading may be in degrees or radians, none is beyond 2 pi; say --name '
+                'heading_deg=heading or --name heading_rad=heading'
+            )
         return values['heading']
     if 'heading_rad' in values:
         return np.degrees(values['heading_rad'])

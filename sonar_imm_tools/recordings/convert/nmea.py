@@ -129,6 +129,8 @@ def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None
         counts = log.unread.most_common(12)
         report.notes['not used'] = ', '.join(f'{count} {name}' for name, count in counts)
     if not rows:
+        if log.unread and not report.problems:
+            report.problems.append(f'not used: {report.notes["not used"]}')
         raise report.nothing(path)
     table = TrackFile(path, None, rows, 'a log of NMEA sentences')
     fixes = FixesOptions(
@@ -478,6 +480,7 @@ def _take_ais(log: _Log, message: Any, stamp: int | None, own: bool) -> None:
     if latitude > 90.0 or longitude > 180.0:
         raise BadRow('says that it has no position', 'no position')
     if own:
+        log.unread['AIS reports of the own ship (VDO)'] += 1
         return
     std = ACCURATE if message.accuracy else INACCURATE
     row = _row(stamp_ns, latitude, longitude)

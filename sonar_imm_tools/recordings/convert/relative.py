@@ -30,7 +30,14 @@ from ..conversion import ConversionReport, converter, Leaps, Record, write_bag
 from ..convert_options import RelativeOptions
 from ..csv_table import CsvTable
 from ..messages import ros_message
-from ..places import bearings_from, checked_origin, Degrees, origin_parameters, PolarRows
+from ..places import (
+    ask_for_angle,
+    bearings_from,
+    checked_origin,
+    Degrees,
+    origin_parameters,
+    PolarRows,
+)
 from ..sources import BagError
 from ..tables import Row
 from ..times import BadRow
@@ -87,8 +94,11 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
         )
     place = ('range', 'bearing') if polar else ('forward', 'starboard')
 
+    headings: list[float] = []
+
     def parse(row: Row) -> _Parsed:
         row.require_valid()
+        headings.append(row.optional('heading'))
         stamp_ns, name = row.stamp_ns(), row.text('id')
         pose = _pose(row, stamp_ns, degrees, levelled, how.frame_id)
         if row.empty(*place):
@@ -109,6 +119,8 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     rows = [parsed for _, parsed in report.read_rows(table, parse)]
     if polar:
         polar.check_unit()
+    if not levelled:
+        ask_for_angle(table, 'heading', headings)
     leaps = Leaps()
     if geodetic:
         leaps.saw_all(row.pose[0][2] for row in rows)

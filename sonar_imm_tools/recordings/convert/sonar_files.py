@@ -52,11 +52,13 @@ class Message(NamedTuple):
 
 @define
 class Frame:
-    """Metres from the first position. missing: pings without a position."""
+    """Metres from the first position. missing: pings without a position; beyond: the first of
+    those with another one than is on Earth."""
 
     frame_id: str = 'map'
     origin: Origin | None = None
     missing: int = 0
+    beyond: str = ''
     last_ns: int = -1
     leaps: Leaps = Factory(Leaps)
 
@@ -68,6 +70,8 @@ class Frame:
         on_earth = abs(east) <= 180.0 and abs(north) <= 90.0 and (east or north)
         if not (known and record['units'] and (on_earth or not geodetic)):
             self.missing += 1
+            if known and geodetic and (east or north):
+                self.beyond = self.beyond or f'latitude {north:g}, longitude {east:g}'
             return None
         if geodetic:
             self.origin = self.origin or Origin(north, east)
@@ -94,8 +98,8 @@ class Frame:
         """Report the origin, and what is missing or looks wrong."""
         if self.missing:
             report.problems.append(
-                f'{path.name}: {self.missing} pings have no position (0, 0 is none); they have no '
-                'navigation'
+                f'{path.name}: {self.missing} pings have no position '
+                f'({self.beyond or "0, 0"} is none); they have no navigation'
             )
         self.leaps.tell(path, report)
         if place := self.origin:

@@ -88,21 +88,31 @@ def test_many_pings_with_stamps_and_own_variances(convert):
 
 
 def test_without_stamps_pings_follow_the_rate(convert):
-    _, received, _ = convert({'ping_rate': 4.0}, Y=samples(3, 10, 4), time=RANGE / 750.0)
+    report, received, _ = convert({'ping_rate': 4.0}, Y=samples(3, 10, 4), time=RANGE / 750.0)
+    assert report.notes['stamps'] == 'the archive states none: 4 pings a second (--ping-rate)'
     assert np.diff([item.stamp_ns for item in received]).tolist() == [250_000_000] * 2
     assert np.allclose(received[0].range, RANGE)
 
 
-def test_times_of_pings_are_stamps_and_times_beside_ranges_are_named(convert):
-    report, received, _ = convert(iq=samples(3, 10, 4), range=RANGE, time=[5.0, 6.5, 7.0])
-    assert [item.stamp_ns for item in received] == [5 * 10**9, 65 * 10**8, 7 * 10**9]
-    assert 'stamps' not in report.notes
+SECONDS = 1_748_944_800 + np.array([0.0, 0.5, 1.25])
 
 
-def test_times_of_samples_beside_ranges_are_not_used_and_named(convert):
-    report, _, _ = convert(iq=samples(3, 10, 4), range=RANGE, two_way_time=RANGE / 750.0)
-    assert 'two_way_time' in str(report.notes)
-    assert report.notes['stamps'] == 'none in the archive: 10 pings per second'
+@pytest.mark.parametrize(
+    'times',
+    [
+        {'Timestamps': SECONDS},
+        {'stamp': 1e3 * SECONDS},
+        {'stamp': (1e9 * SECONDS).astype(np.int64)},
+        {'ping_time': (1e6 * SECONDS).astype('M8[us]')},
+        {'time': SECONDS},
+    ],
+)
+def test_times_of_pings_in_other_units_and_by_other_names(convert, times):
+    report, received, _ = convert(iq=samples(3, 10, 4), range=RANGE, **times)
+    stamps = np.array([item.stamp_ns for item in received])
+    assert np.abs(stamps - (1e9 * SECONDS).astype(np.int64)).max() < 1000
+    assert not {'stamps', 'ignored arrays of pings.npz'} & set(report.notes)
+    assert np.allclose(received[0].range, RANGE)
 
 
 def test_the_truth_of_a_test_vector(convert):
@@ -128,7 +138,9 @@ POSES = {
 EAST_NORTH = {'x': np.arange(3.0), 'y': np.full(3, 7.0), 'yaw': np.full(3, math.radians(60.0))}
 
 
-@pytest.mark.parametrize('poses', [POSES, EAST_NORTH])
+@pytest.mark.parametrize(
+    'poses', [POSES, {name.title(): value for name, value in POSES.items()}, EAST_NORTH]
+)
 def test_places_and_attitude_of_each_ping_become_navigation(convert, poses):
     more = {'z': -2.0, 'roll_deg': np.full(3, 5.0), 'pitch_rad': 0.1, 'altitude': 12.0}
     report, received, _ = convert(
@@ -138,7 +150,7 @@ def test_places_and_attitude_of_each_ping_become_navigation(convert, poses):
     assert report.messages == {'/nav': 3, '/altitude': 3, '/snapshot': 3}
     assert report.notes['ignored arrays of pings.npz'] == 'odd'
     poses_read = [item for item in received if isinstance(item, Navigation)]
-    step = (1e-5 * 111_414.0 if 'latitude' in poses else 0.0, 0.0 if 'latitude' in poses else 1.0)
+    step = (0.0, 1.0) if 'x' in poses else (1e-5 * 111_414.0, 0.0)
     for k, pose in enumerate(poses_read):
         north, east = step
         start = poses_read[0].position
@@ -169,6 +181,7 @@ def test_the_origin_of_degrees_counts_beside_other_parameters(convert, tmp_path)
         ({'x': np.zeros(3), 'y': np.zeros(3)}, '--name heading=ARRAY'),
         ({**POSES, 'roll': np.full(3, 0.1)}, '--name roll_rad=roll'),
         ({**POSES, 'heading': np.zeros(4)}, 'heading has the shape'),
+        ({**POSES, 'heading': np.full(3, 1.2)}, '--name heading_deg=heading'),
     ],
 )
 def test_navigation_that_can_be_read_in_two_ways_is_asked(convert, poses, words):
@@ -212,7 +225,8 @@ def test_bad_pings_are_left_out_and_named(convert):
     'options, arrays, word',
     [
         ({}, {'range': RANGE}, 'no array iq or'),
-        ({}, {'iq': samples(10, 4)}, 'no array time'),
+        ({}, {'iq': samples(10, 4)}, 'no array range or .* or time'),
+        ({}, {'iq': samples(1, 4, 10), 'range': RANGE, 'x': 0, 'y': 0, 'yaw': 0}, 'for 4 bins'),
         ({}, {'iq': np.ones((10, 4)), 'range': RANGE}, 'complex'),
         ({}, {'iq': samples(10), 'range': RANGE}, 'shape'),
         ({}, {'iq': samples(10, 4), 'range': RANGE[:9]}, 'nothing that could be converted'),

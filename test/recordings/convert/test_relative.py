@@ -280,7 +280,8 @@ def test_hostile_rows_cost_a_sentence_each(convert, kind, header, good, bad, wor
         ('relative', 'stamp,vessel_x,vessel_y,heading', {}, 'no column for range and bearing'),
         ('relative', 'stamp,vessel_x,vessel_y,forward,starboard', {}, 'no column for heading'),
         ('relative', 'stamp,heading,forward,starboard', {}, 'no column for vessel_x and vessel_y'),
-        ('relative', GPS, {'origin': (91.0, 0.0)}, 'an origin is'),
+        ('relative', GPS, {}, 'heading may be degrees or radians'),
+        ('relative', GPS.replace('heading', 'heading_deg'), {'origin': (91.0, 0.0)}, 'an origin'),
     ],
 )
 def test_a_table_that_says_too_little_is_told_what_is_missing(
