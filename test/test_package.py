@@ -369,7 +369,7 @@ def test_the_examples_of_the_library_run(capsys: pytest.CaptureFixture[str]) -> 
         exec(compile(example, 'library.md', 'exec'), {})
         assert capsys.readouterr().out
     lines = [line for line in examples[0].splitlines() if line.strip()]
-    assert len(examples) == 3 and len(lines) <= 10
+    assert len(examples) == 4 and len(lines) <= 10
 
 
 def texts(manifest: ElementTree.Element, tag: str) -> set[str]:
