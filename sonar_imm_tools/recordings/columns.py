@@ -115,7 +115,8 @@ USUAL_NAMES = {
     'status': 'fix_status position_status zustand etat statut estado',
     'tag': (
         'tag_id transmitter transmitter_id tx tx_id full_id tagname tag_name '
-        'acoustic_tag_id signal'
+        'acoustic_tag_id signal sender sender_id sendernummer emetteur transmisor transmissor '
+        'marca marque merke'
     ),
     'code_space': 'codespace transmitter_codespace tag_code_space',
     'ping': 'ping_id ping_number',

@@ -65,6 +65,8 @@ def converted(folder, text, kind, *options):
         ('Latitude_deg;lon [deg]', 'latitude longitude'),
         ('GPS Lat;GPS Long', 'latitude longitude'),
         ('lat_dd;lon_dd', 'latitude longitude'),
+        ('Zeitstempel;Empfänger;Sender-ID', 'stamp receiver tag'),
+        ('Fecha y hora;Receptor;Transmisor', 'stamp receiver tag'),
     ],
 )
 def test_headers_in_six_languages(table, headers, found):
