@@ -39,8 +39,10 @@ class Origin:
     longitude: float
     height: float = 0.0
 
-    def local(self, latitude: float, longitude: float, height: float = 0.0) -> FloatArray:
-        """East, north, up (3,) in metres of a place in degrees and metres."""
+    def local(
+        self, latitude: float | FloatArray, longitude: float | FloatArray, height: float = 0.0
+    ) -> FloatArray:
+        """East, north, up (3,) or (3, n) in metres of one place or n in degrees and metres."""
         from pymap3d import geodetic2enu  # only needed for latitudes
 
         return np.array(

@@ -140,10 +140,12 @@ def _differences(name: str, old: Any, new: Any) -> str:
 
 def _complete(job: Job, run: Mapping[str, Any]) -> bool:
     """Whether the tables are there that are wanted."""
+    if job.tables == NO_TABLE:
+        return RunFolder(job.folder).bins() is None
     names = [CSV, *([SOUNDINGS] if 'soundings' in run else [])]
     if job.tables == AS_PARQUET:
         names = [PARQUET[name] for name in names]
-    return job.tables == NO_TABLE or all((job.folder / name).is_file() for name in names)
+    return all((job.folder / name).is_file() for name in names)
 
 
 def _outcome(job: Job, state: str, run: Mapping[str, Any]) -> Outcome:

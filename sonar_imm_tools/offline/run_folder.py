@@ -16,8 +16,9 @@ run.json       input, parameters, versions; a folder without it is unfinished
 metrics.json   and report.html, once evaluated
 .sonar_imm     shows that sonar_imm made the folder; only then `--overwrite` replaces it
 
-With ``--parquet`` there are estimate.parquet and soundings.parquet in place of the CSV, with
-``--no-table`` neither. A run is written elsewhere and moved to its folder when it is finished, see
+With ``--parquet`` there are estimate.parquet and soundings.parquet in place of the CSV, and bins
+that have soundings are in the table alone; with ``--no-table`` neither. Without CSV the bag is
+compressed by zstd. A run is written elsewhere and moved to its folder when it is finished, see
 `sonar_imm.files`.
 
 Bag and tables hold nothing that depends on the time of the run: the same command writes the same
@@ -61,6 +62,7 @@ from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers import SYSTEMS
 
 from ..recordings.csv_writer import CsvWriter, ROWS_IN_A_BLOCK
+from ..recordings.export.points import read_parquet
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
 from ..recordings.truth import TRUTH_TOPIC
@@ -175,8 +177,8 @@ def require_parquet() -> None:
 class ParquetTable(Table):
     """A table as Parquet, with the types of the columns: stamp_ns is int64.
 
-    notes: texts kept in the metadata of the file, by name. Raises ModuleNotFoundError without
-    pyarrow.
+    notes: texts kept in the metadata of the file, by name, as they are at the first row. Raises
+    ModuleNotFoundError without pyarrow.
     """
 
     rows_in_a_block = 65536
@@ -187,7 +189,7 @@ class ParquetTable(Table):
 
         super().__init__(path, path.open('wb'))  # pyarrow opens only names that are UTF-8
         self._arrow = pyarrow
-        self._notes = dict(notes or {})
+        self._notes = notes or {}
         self._writer: Any = None
 
     def _write(self, columns: dict[str, np.ndarray]) -> None:
@@ -299,7 +301,7 @@ class RunFolder:
         """Write bag and tables while the estimates come; gives the number of estimates and rows,
         the stamp of the first estimate, and the number of soundings where there are any. notes:
         what the metadata of Parquet files say."""
-        written = {'estimates': 0, 'rows': 0}
+        written, notes = {'estimates': 0, 'rows': 0}, dict(notes or {})
         with contextlib.ExitStack() as stack:
 
             def table(name: str) -> list[Table]:
@@ -309,18 +311,21 @@ class RunFolder:
                     return [stack.enter_context(CsvTable(self.path / name))]
                 return [stack.enter_context(ParquetTable(self.path / PARQUET[name], notes))]
 
-            bag = stack.enter_context(BagWriter(self.path / BAG))
+            compressed = tables != AS_CSV  # with CSV beside it, it would save a twentieth
+            bag = stack.enter_context(BagWriter(self.path / BAG, compressed=compressed))
             bins, chart = table(CSV), []
             for estimate in estimates:
-                bag.write(
-                    f'/{system}/estimate', write_estimate(estimate, ros_message), estimate.stamp_ns
-                )
+                soundings = soundings_of(estimate)
+                if soundings is None or tables != AS_PARQUET:
+                    message = write_estimate(estimate, ros_message)
+                    bag.write(f'/{system}/estimate', message, estimate.stamp_ns)
+                notes.setdefault('frame_id', estimate.frame_id)
                 for each in bins:
                     each.write(estimate.stamp_ns, estimate.columns())
                 written.setdefault('first_stamp_ns', estimate.stamp_ns)
                 written['estimates'] += 1
                 written['rows'] += len(estimate)
-                if (soundings := soundings_of(estimate)) is None:
+                if soundings is None:
                     continue
                 if 'soundings' not in written:
                     written['soundings'], chart = 0, table(SOUNDINGS)
@@ -382,9 +387,16 @@ class RunFolder:
             places.append(self.path / BAG)
         return next((place for place in places if place.exists()), None)
 
+    def bins(self) -> Path | None:
+        """The table of a run whose bag lacks the estimates; None where the bag has them."""
+        table = self.path / PARQUET[CSV]
+        return table if 'soundings' in self.read_run() and table.exists() else None
+
     def read_estimates(self) -> list[Estimate]:
-        """The estimates of the run, as written. Raises `BagError` when its bag is damaged."""
-        return _read_estimates(self.path / BAG)
+        """The estimates of the run, as written. Raises `BagError` when its files are damaged, and
+        ModuleNotFoundError without pyarrow where they are Parquet."""
+        table = self.bins()
+        return _read_estimates(self.path / BAG) if table is None else _read_bins(table)
 
 
 def read_json(path: Path) -> Any:
@@ -479,6 +491,27 @@ def _read_estimates(path: Path, topics: list[str] | None = None) -> list[Estimat
             return [read_estimate(item.message) for item in bag.messages(topics)]
     except Rejection as rejection:
         raise BagError(f'{path}: {rejection}') from None
+
+
+def _read_bins(path: Path) -> list[Estimate]:
+    """The estimates of a table of bins: rows of one stamp and side that follow one another."""
+    table = read_parquet(path)
+    try:
+        columns = {name: table[name].to_numpy() for name in table.column_names}
+        frame_id = (table.schema.metadata or {}).get(b'frame_id', b'').decode()
+        stamps = columns.pop('stamp_ns')
+        changes = (np.diff(stamps) != 0) | (np.diff(columns['side']) != 0)
+        ends = [*np.flatnonzero(changes) + 1, len(stamps)] if len(stamps) else []
+        return [
+            Estimate.from_columns(
+                {name: column[start:end] for name, column in columns.items()},
+                stamp_ns=int(stamps[start]),
+                frame_id=frame_id,
+            )
+            for start, end in zip([0, *ends], ends)
+        ]
+    except (LookupError, RuntimeError, TypeError, ValueError) as error:
+        raise BagError(f'{path} is no table of estimates: {error}') from None
 
 
 def run_record(**facts: Any) -> dict[str, Any]:

@@ -88,8 +88,8 @@ USUAL_NAMES = {
         'skraavstand horizontal_range horizontal_distance ground_range'
     ),
     'std_range': 'sigma_range range_std',
-    'forward': 'ahead fwd rel_forward',
-    'starboard': 'stbd rel_starboard',
+    'forward': 'ahead fwd rel_forward voraus vorwaerts avant adelante frente forover foran forut',
+    'starboard': 'stbd rel_starboard steuerbord tribord estribor estibordo boreste styrbord',
     'vessel_x': '',
     'vessel_y': '',
     'vessel_latitude': '',

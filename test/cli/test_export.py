@@ -9,13 +9,16 @@
 """``sonar-imm export``: from a scene of a moving ship to files that other programs read."""
 
 import json
+import re
 
 from helpers.commands import run
 from helpers.report_pages import figures
 import numpy as np
 import pytest
 
+from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.recordings.export.points import read_points
+from sonar_imm_tools.recordings.reader import BagError, BagReader
 from sonar_imm_tools.survey.chart import OF_ONE_RUN
 
 SMALL = ('--set', 'pings=3', '--set', 'last_range=30', '--set', 'bin_width=0.1')
@@ -52,8 +55,38 @@ def test_soundings_are_the_same_from_any_table(tables, tracked, tmp_path):
     (line,) = json.loads((tmp_path / 'chart' / 'survey.json').read_text())['lines']
     assert line['soundings'] == len(read_points(tracked / 'soundings.csv'))
     assert not json.loads((tmp_path / 'chart' / 'survey.json').read_text())['warnings']
+    ours, theirs = (RunFolder(f).read_estimates() for f in (tmp_path / 'runs' / 'line', tracked))
+    for our, their in zip(ours, theirs, strict=True):
+        assert (our.stamp_ns, our.frame_id) == (their.stamp_ns, their.frame_id)
+        assert [*our.columns()] == [*their.columns()]
+        for mine, other in zip(our.columns().values(), their.columns().values()):
+            np.testing.assert_array_equal(mine, other, strict=True)
     assert run('evaluate', tmp_path / 'runs' / 'line') == 0
     assert 'soundings in cells of' in (tmp_path / 'runs' / 'line' / 'report.html').read_text()
+
+
+def test_bins_are_in_the_table_or_in_the_bag(tracked, tmp_path, capsys):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    place, again = tmp_path / 'bag', ('--set', 'particles_per_model=30', '--shard', '1/1')
+    sizes = {}
+    for tables in ('--parquet', '--no-table', '--no-table', '--parquet'):
+        assert run('track', tracked.parent / 'bag', tmp_path, *again, tables) == 0
+        with BagReader(place / 'estimate') as bag:
+            topics = {topic.name.rpartition('/')[2]: topic.count for topic in bag.topics}
+        sizes[tables] = json.loads((place / 'run.json').read_text())['written_bytes']
+        assert topics == {'soundings': 6} | ({'estimate': 6} if tables == '--no-table' else {})
+    assert re.findall(r'(\d) tracked, (\d) kept', capsys.readouterr().out) == [
+        ('1', '0'), ('1', '0'), ('0', '1'), ('1', '0')
+    ]  # fmt: skip
+    plain = json.loads((tracked / 'run.json').read_text())['written_bytes']
+    assert all(size < 0.35 * plain for size in sizes.values())
+    table = place / 'estimate.parquet'
+    parquet.write_table(parquet.read_table(table).drop_columns('z'), table)
+    with pytest.raises(BagError, match='is no table of estimates: an estimate table'):
+        RunFolder(place).read_estimates()
+    table.write_bytes(table.read_bytes()[:-9])
+    with pytest.raises(BagError, match='estimate.parquet cannot be read: '):
+        RunFolder(place).read_estimates()
 
 
 def test_xyz_las_and_tif_hold_the_same_floor(tracked, tmp_path):

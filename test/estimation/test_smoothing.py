@@ -121,13 +121,16 @@ def test_rts_with_a_velocity_without_memory_and_without_noise(noise):
 # -- IMM: exact cases -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('models', [1, 3])
-def test_models_that_are_all_the_same_give_rts_and_the_chain_alone(models):
-    """The data say nothing about the model: smoothed probabilities are those of the chain."""
+@pytest.mark.parametrize('models, moves_at_all', [(1, True), (3, True), (3, False)])
+def test_models_that_are_all_the_same_give_rts_and_the_chain_alone(models, moves_at_all):
+    """The data say nothing about the model: smoothed probabilities are those of the chain. The
+    second number may be known exactly after each step."""
     rng = np.random.default_rng(3)
     K, H, R = 9, np.array([[1.0, 0.0]]), np.eye(1)
     F, Q, B = rng.normal(size=(K, 2, 2)), covariance(rng, K, 2), rng.normal(size=(K, 2))
     Z, mu0 = rng.normal(size=(K, 1)), rng.dirichlet(np.ones(models))
+    if not moves_at_all:
+        F[:, 1] = Q[:, 1] = Q[:, :, 1] = 0.0
     transition = np.stack([chain(rng, models) for _ in range(K)])
     moves = [transition, *(np.repeat(part[:, None], models, axis=1) for part in (F, Q, B))]
     x0, P0 = np.zeros((models, 2)), repeat(np.eye(2), models)

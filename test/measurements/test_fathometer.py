@@ -192,6 +192,19 @@ def test_pressure_that_cannot_be_used(pressure, rate, reason):
     assert reason_of(Pressure, pressure=pressure, sample_rate=rate) == reason
 
 
+@pytest.mark.parametrize(
+    'make, fields',
+    [
+        (Pressure, {'pressure': samples(), 'sample_rate': 100.0}),
+        (Trace, {'depth': np.arange(9.0), 'amplitude': np.ones(9)}),
+    ],
+)
+def test_a_record_without_a_time_is_refused(make, fields):
+    assert make(stamp_ns=1, **fields).stamp_ns == 1
+    with pytest.raises(Rejection, match='the header stamp is 0 ns'):
+        make(stamp_ns=0, **fields)
+
+
 def test_a_hydrophone_with_a_lost_sample_is_masked():
     p = samples()
     p[7, 1] = np.nan

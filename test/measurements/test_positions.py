@@ -21,6 +21,7 @@ from sonar_imm.measurements import (
     VesselHeading,
     VesselPose,
 )
+from sonar_imm.measurements.variances import by_axis, check_flat, filled
 
 WHOLE = {
     Fix: {'position': (1.0, 2.0, 3.0)},
@@ -53,6 +54,21 @@ def test_a_single_number_that_is_not_finite_is_refused(kind):
     for values in asked:
         with pytest.raises(Rejection):
             kind(stamp_ns=1, **values)
+
+
+@pytest.mark.parametrize('variances', [(np.inf, 1.0), (1.0, np.inf), (np.inf, np.inf)])
+def test_one_axis_that_is_not_measured_is_enough(variances):
+    with pytest.raises(Rejection, match='states that x or y is not measured') as caught:
+        check_flat(np.diag(variances), 'a fix')
+    assert caught.value.reason == 'not_measured'
+
+
+def test_an_axis_of_which_nothing_is_said_gets_what_is_assumed():
+    assumed = np.diag([1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(filled(None, assumed), assumed)
+    np.testing.assert_array_equal(filled(np.zeros((3, 3)), assumed), assumed)
+    stated = by_axis(np.diag([4.0, -1.0, 9.0]))
+    np.testing.assert_array_equal(filled(stated, assumed), np.diag([4.0, 2.0, 9.0]))
 
 
 def _is_depth(kind, values):

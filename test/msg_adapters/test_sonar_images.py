@@ -16,6 +16,7 @@ import pytest
 from msg_adapters.inputs import inputs_of
 from msg_adapters.sonar_images import DTYPES, write_picture
 from sonar_imm.measurements import Rejection, SonarImage, SonarInfo
+from sonar_imm.measurements.obstacle import MAX_IMAGE_CELLS
 from sonar_imm.trackers.obstacle import detector
 from sonar_imm.trackers.obstacle.detector import DetectorConfig, ImageDetector
 from sonar_imm_tools.recordings.messages import ros_message
@@ -391,6 +392,7 @@ def test_an_echo_of_a_ping360_is_one_direction_of_a_sweep():
     'changes, code',
     [
         ({'intensities': np.zeros(0, np.uint8)}, 'short_data'),
+        ({'intensities': np.zeros(MAX_IMAGE_CELLS + 1, np.uint8)}, 'too_large'),
         ({'range': 0}, 'out_of_range'),
         ({'angle': np.nan}, 'out_of_range'),
         ({'angle': 1e30}, 'out_of_range'),

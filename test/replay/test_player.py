@@ -34,7 +34,7 @@ from sonar_imm_tools.replay import player as player_module
 from sonar_imm_tools.replay.harness import LockstepResult, reserved_domain_id, run_lockstep
 from sonar_imm_tools.replay.link import Link, LinkError
 from sonar_imm_tools.replay.lockstep import Counts
-from sonar_imm_tools.replay.player import NAME, Pace, Pause, play, Player, PlayOptions
+from sonar_imm_tools.replay.player import NAME, Pace, Pause, play, Player, PlayOptions, Ticker
 
 
 @pytest.fixture
@@ -52,6 +52,13 @@ def test_a_bag_is_played_in_order_with_its_stamps(bag, link, domain):
     np.testing.assert_array_equal(positions, [np.nan if k == 3 else k for k in range(COUNT)])
     stamp = ear.received[-1].header.stamp
     assert stamp.sec * 10**9 + stamp.nanosec == START + (COUNT - 1) * STEP
+
+
+def test_the_clock_ticks_as_often_as_asked(link):
+    ticker = Ticker(link, 0.01)
+    assert ticker.until_next() == 0.0
+    ticker.tick(START)
+    assert 90.0 < ticker.until_next() <= 100.0
 
 
 def test_topics_remapping_and_offset(bag, link, domain):

@@ -38,6 +38,14 @@ def test_a_table_for_which_there_is_no_room_says_so(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_no_signature_stands_beside_a_table_that_could_not_be_made(tmp_path):
+    path = tmp_path / 'looks.npy'
+    path.with_suffix('.json').write_text('{}')
+    with pytest.raises(ValueError, match='shape'):
+        jobs._save_table(path, {'a': np.zeros(2), 'b': np.zeros(3)})
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_table_is_read_as_it_was_kept(tmp_path):
     columns = {'stamp_ns': np.arange(3), 'xy': np.arange(6.0).reshape(3, 2)}
     jobs._save_table(tmp_path / 'looks.npy', columns)

@@ -42,6 +42,7 @@ from ..sources import BagError
 from ..tables import Row
 from ..truth import records_of
 from .navigation import ARRAYS, navigation_of_arrays, navigation_of_table
+from .sonar_files import Frame
 
 NAMES: dict[str, tuple[str, ...]] = {
     'iq': ('iq', 'snapshots', 'Y', 'quadrants'),
@@ -95,8 +96,9 @@ def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionRepor
     constants = {name: content.number(name) for name in _CONSTANTS}
     constants['element_spacing'] = _element_spacing(content, constants, report)
     poses = {name: array for name in ARRAYS if (array := content.get(name)) is not None}
-    records = navigation_of_table(how.nav, how.nav_options, report, on_earth=False)
-    records += [] if how.nav else navigation_of_arrays(poses, stamps, path, report)
+    frame = Frame()
+    records = navigation_of_table(how.nav, how.nav_options, report, on_earth=False, frame=frame)
+    records += [] if how.nav else navigation_of_arrays(poses, stamps, path, report, frame)
     for ping, (stamp, iq) in enumerate(zip(stamps, samples)):
         report.rows += 1
         try:
@@ -109,7 +111,13 @@ def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionRepor
             records += records_of(profile, '')
     report.note_ignored(path, content.unused)
     write_bag(
-        report.path, records, report, source=path.name, storage=how.storage, needed='/snapshot'
+        report.path,
+        records,
+        report,
+        source=path.name,
+        storage=how.storage,
+        parameters={'bathymetry': frame.parameters()},
+        needed='/snapshot',
     )
 
 
@@ -118,6 +126,8 @@ class _Archive:
 
     def __init__(self, path: str | Path, names: Mapping[str, str]):
         self.path = Path(path)
+        usual = {other: what for what, others in NAMES.items() for other in others}
+        names = {usual.get(name, name): array for name, array in names.items()}
         if unknown := [name for name in names if name not in NAMES]:
             raise BagError(f"unknown array '{unknown[0]}'; the names are {', '.join(NAMES)}")
         there = read_npz(self.path)

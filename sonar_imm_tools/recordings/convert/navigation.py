@@ -56,10 +56,15 @@ _SMALL = math.radians(90.0)
 
 
 def navigation_of_table(
-    path: Path | str | None, options: CsvOptions, report: ConversionReport, *, on_earth: bool
+    path: Path | str | None,
+    options: CsvOptions,
+    report: ConversionReport,
+    *,
+    on_earth: bool,
+    frame: Frame | None = None,
 ) -> list[Stamped]:
     """Return the messages of a table of positions: ``/position`` if `on_earth` and the table has
-    degrees, else ``/nav``. Raises `BagError`."""
+    degrees, else ``/nav``, in `frame`. Raises `BagError`."""
     if path is None:
         return []
     with flags_of('nav', report):
@@ -92,14 +97,18 @@ def navigation_of_table(
             for row in rows
         ]
     records = ({**row, 'units': units, 'altitude': math.nan} for row in rows)
-    return list(_messages(records, Path(path), report))
+    return list(_messages(records, Path(path), report, frame or Frame()))
 
 
 def navigation_of_arrays(
-    arrays: Mapping[str, NDArray], stamps: list[int], path: Path, report: ConversionReport
+    arrays: Mapping[str, NDArray],
+    stamps: list[int],
+    path: Path,
+    report: ConversionReport,
+    frame: Frame,
 ) -> list[Stamped]:
-    """Return the ``/nav`` and ``/altitude`` messages of arrays by the names of `ARRAYS`, one value
-    per ping; none without a place. Raises `BagError`."""
+    """Return the ``/nav`` and ``/altitude`` messages in `frame` of arrays by the names of
+    `ARRAYS`, one value per ping; none without a place. Raises `BagError`."""
     count = len(stamps)
     values: dict[str, NDArray] = {}
     for name, array in arrays.items():
@@ -128,14 +137,13 @@ def navigation_of_arrays(
         }
         for k in range(count)
     )
-    return list(_messages(records, path, report))
+    return list(_messages(records, path, report, frame))
 
 
 def _messages(
-    records: Iterator[Record], path: Path, report: ConversionReport
+    records: Iterator[Record], path: Path, report: ConversionReport, frame: Frame
 ) -> Iterator[Stamped]:
     """Yield the messages of each record; what cannot be used is counted."""
-    frame = Frame()
     for k, record in enumerate(records):
         try:
             navigation = frame.navigation(record)

@@ -75,7 +75,8 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     degrees = Degrees(table, 'vessel_') if geodetic else None
     polar = None
     if not table.has('forward', 'starboard'):
-        table.require('range', 'bearing')
+        across = table.has('forward') or table.has('starboard')
+        table.require(*(('forward', 'starboard') if across else ('range', 'bearing')))
         bearings = bearings_from(table, how.bearings, 'bow')
         polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg, how.ranges)
     levelled = polar is not None and bearings != 'bow'
@@ -132,6 +133,8 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     if geodetic and rows and origin is None:
         first: VesselFix = rows[0].pose[0][2]
         origin = (first.latitude, first.longitude, 0.0)
+    if geodetic and origin is not None:
+        report.notes['origin'] = 'latitude {!r}, longitude {!r}, height {!r}'.format(*origin)
     records: list[Record] = []
     if any(row.fix is not None for row in rows):
         records = _poses(rows) + [_target(row, tags, how.frame_id) for row in rows]

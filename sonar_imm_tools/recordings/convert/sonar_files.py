@@ -38,6 +38,7 @@ from ..times import BadRow
 from ..writer import BagWriter
 
 LATEST = 2**31 * SECOND
+_SYSTEMS = {'detections': 'obstacle', 'snapshot': 'bathymetry'}
 Record = dict[str, Any]
 """What a reader says of a ping or a picture; see `xtf.pings_of`."""
 
@@ -86,6 +87,12 @@ class Frame:
             orientation=_orientation(record['heading'], pitch, roll),
             frame_id=self.frame_id,
         )
+
+    def parameters(self) -> dict[str, list[float]]:
+        """The origin as a parameter of nodes; nothing for places in metres."""
+        if (place := self.origin) is None:
+            return {}
+        return origin_parameters((place.latitude, place.longitude, 0.0))
 
     def tell(self, path: Path, report: ConversionReport) -> None:
         """Report the origin, and what is missing or looks wrong."""
@@ -149,9 +156,10 @@ def write_records(
             for message in made:
                 bag.write(message.topic, message.content, stamp_ns)
                 report.messages[message.topic] += 1
-        if '/detections' in report.messages and frame.origin is not None:
-            place = origin_parameters((frame.origin.latitude, frame.origin.longitude, 0.0))
-            own['obstacle'] = {**own.get('obstacle', {}), **place}
+        if place := frame.parameters():
+            for topic in report.messages:
+                if system := _SYSTEMS.get(topic.rpartition('/')[2]):
+                    own[system] = {**own.get(system, {}), **place}
         if not set(report.messages) - {'/nav', '/altitude'}:
             raise report.nothing(path)
     frame.tell(path, report)

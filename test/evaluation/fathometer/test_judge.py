@@ -80,6 +80,9 @@ def test_false_missed_amplitudes_and_switches_are_counted():
         record(reflections([129.9], [4.0], [1]), true, 3, order=2),
         record(reflections([]), true, 4, order=5, preview=True),
     ]
+    silent = record(reflections([130.0], [4.0]), reflections([130.0], [0.0]))
+    assert score([silent])['amplitude'] == {'n': 0}
+    assert score([*records, silent])['amplitude']['n'] == 5
     metrics = score(records)
     assert metrics['records'] == 3 and metrics['previews'] == 1
     assert metrics['order_right'] == pytest.approx(2 / 3)

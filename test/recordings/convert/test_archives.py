@@ -17,9 +17,11 @@ import numpy as np
 import pytest
 
 from msg_adapters.estimates import read_estimate
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.geometry import rotation_of_quaternion
 from sonar_imm.measurements import Navigation
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.cli.track import Plan
 from sonar_imm_tools.recordings.convert import (
     convert_segy,
     convert_snapshots,
@@ -49,6 +51,9 @@ def convert(tmp_path):
         return report, received, truth
 
     return run
+
+
+POSE = {'x': 1.0, 'y': 2.0, 'heading': 90.0}
 
 
 def samples(*shape):
@@ -159,6 +164,16 @@ def test_places_and_attitude_of_each_ping_become_navigation(convert, poses):
         assert starboard[2] == pytest.approx(-math.sin(math.radians(5.0)) * math.cos(0.1))
 
 
+def test_the_origin_of_degrees_counts_beside_other_parameters(convert, tmp_path):
+    convert(iq=samples(3, 30, 4), range=RANGES, **POSES)
+    params = tmp_path / 'my.yaml'
+    params.write_text('/**: {ros__parameters: {sonar_height: 12.0}}')
+    for chosen in (None, params):
+        (job,) = Plan(params=chosen).jobs(tmp_path / 'bag', tmp_path / 'out')
+        assert job.options.origin == Origin(59.43, 10.47)
+    assert job.config.sonar_height == 12.0
+
+
 @pytest.mark.parametrize(
     ('poses', 'words'),
     [
@@ -225,6 +240,7 @@ def test_bad_pings_are_left_out_and_named(convert):
          'one finite number'),
         ({'staves': [[0, 4], [1]]}, {'iq': samples(10, 4), 'range': RANGE}, 'channels 0 to 3'),
         ({'names': {'iq': 'data'}}, {'iq': samples(10, 4), 'range': RANGE}, "no array 'data'"),
+        ({}, {'iq': samples(10, 4), 'range': RANGE[:9], **POSE}, 'nothing that could be'),
         ({'names': {'data': 'iq'}}, {'iq': samples(10, 4), 'range': RANGE}, 'unknown array'),
         ({}, {'iq': np.array([{}]), 'range': RANGE}, 'more than plain arrays'),
     ],

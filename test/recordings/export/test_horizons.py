@@ -10,6 +10,7 @@
 
 import csv
 import json
+import shutil
 import struct
 
 from helpers.segy_files import write_segy
@@ -84,6 +85,18 @@ def test_the_table_has_every_pick_by_horizon(tracked):
         way = step * min(int(row['trace']) - 1, T // STACK - 1.75)
         assert float(row['distance_m']) == pytest.approx(way, abs=0.02)
     assert rows[0]['time_utc'].startswith('2018-03-13T00:00:00.')
+
+
+@pytest.mark.parametrize('speed', [True, '1500', None, 0.0, 1e5])
+def test_a_speed_of_a_run_that_is_none_is_said(tracked, tmp_path, capsys, speed):
+    shutil.copytree(tracked / 'run', tmp_path / 'run')
+    run = json.loads((tmp_path / 'run' / 'run.json').read_text())
+    run['parameters']['sound_speed'] = speed
+    (tmp_path / 'run' / 'run.json').write_text(json.dumps(run))
+    assert export(tmp_path, 'h.csv') == 2
+    assert f'the sound_speed in the run.json of {tmp_path / "run"} is no speed' in (
+        capsys.readouterr().err
+    )
 
 
 def test_map_coordinates(tracked):

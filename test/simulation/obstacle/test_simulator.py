@@ -9,6 +9,7 @@
 """Obstacle scenes: the same for the same seed, and physically what they say."""
 
 from functools import cache
+import re
 
 from helpers.scenes import smaller_scene
 import numpy as np
@@ -48,6 +49,12 @@ def test_each_obstacle_has_its_truth_and_the_sea_another_motion_by_seed(name):
         not np.array_equal(a.position, b.position)
         for a, b in zip(of(first, Navigation), of(other, Navigation))
     )
+
+
+@pytest.mark.parametrize('name', SCENARIOS)
+def test_a_target_is_as_large_as_its_scene_says(name):
+    for size in re.findall(r'(?:chain|wreck) of (\d+) m', SCENARIOS[name][0]):
+        assert scenario(name).target_size == float(size)
 
 
 def test_the_offset_is_the_one_asked_for():

@@ -188,5 +188,7 @@ def test_soundings_of_others():
         read_ground(message)
     with pytest.raises(Rejection, match='ground'):
         read_ground(encode_table({'x': np.zeros(1)}, **options), world_frame='ned')
+    nothing = read_ground(encode_table({}, **options), world_frame='ned')
+    assert not len(nothing.position)
     with pytest.raises(Rejection, match='variances'):
         Ground(stamp_ns=1, position=np.zeros((2, 3)), variance=np.zeros(1))
