@@ -31,7 +31,6 @@ from sonar_imm_tools.evaluation.bathymetry.scoring import score
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 APART: dict[str, Any] = {'ping_rate': 0.3, 'patch_along': []}
-GRID: dict[str, Any] = {'engine': 'grid'}
 TERRAIN: dict[str, Any] = {'model_set': 'terrain'}
 LOST = 1.0
 """Metres of RMSE from which a ping is lost."""
@@ -54,10 +53,10 @@ STAVES = ((0.5, 0.0, 0.0), (3.66, 0.2, 0.0), (3.66, 0.2, 0.2))
 # Name: scenario, what it changes, parameters beside those of the instruments.
 CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     'motion, terrain': ('moving', APART, TERRAIN),
-    'motion, grid': ('moving', APART, GRID),
-    'motion, navigation ignored': ('moving', APART, {**GRID, 'navigation': 'ignored'}),
+    'motion, walks': ('moving', APART, {}),
+    'motion, navigation ignored': ('moving', APART, {'navigation': 'ignored'}),
     'summer profile, terrain': ('moving_profile', APART, TERRAIN),
-    'summer profile ignored': ('moving_profile', APART, {**GRID, 'sound_speed_profile': []}),
+    'summer profile ignored': ('moving_profile', APART, {'sound_speed_profile': []}),
     'height 10 m, told 15, terrain': ('moving', unknown(10.0), {**STATED, **TERRAIN}),
     'nadir, terrain': ('paper', {'first_range': 15.1}, TERRAIN),
     **{
@@ -72,7 +71,7 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
         f'staves 2, {spacing:g} wavelengths, {share:.0%} differ, told {stated:.0%}': (
             'paper',
             {'staves': 2, 'spacing_wavelengths': spacing, 'decorrelation': share},
-            {**GRID, 'decorrelation': stated},
+            {'decorrelation': stated},
         )
         for spacing, share, stated in STAVES
     },

@@ -51,9 +51,6 @@ CASES = {
     'bathymetry, with navigation': Case(
         'bathymetry', ('Snapshot', 'Navigation'), {'navigation': 'required'}
     ),
-    'bathymetry, grid': Case(
-        'bathymetry', ('Snapshot',), {'model_set': 'height_two_rw', 'engine': 'grid'}
-    ),
     'bathymetry, everything': Case('bathymetry', (), {'navigation': 'required'}),
     'fathometer, traces': Case('fathometer', ('Trace',)),
     'fathometer, heave': Case('fathometer', ('Trace',), {'heave': 'memory'}),

@@ -116,8 +116,8 @@ heights of the rough patch are white, with a standard deviation of .5 m, and the
 flat."""
 
 
-ONCE = 'tow tag, a fix in 29 s', 'bathymetry, rough patch'
-"""Rows with one recording only: there is no other, or two minutes go into each."""
+ONCE = ('tow tag, a fix in 29 s',)
+"""Rows with one recording only: there is no other."""
 
 
 def wandering(out: Path, seed: int, fixes: str, noise: str) -> None:

@@ -20,7 +20,8 @@ the middle in all of them; errors with a sign are ranked by their size. The limi
 what nine in ten of these runs stay below, rounded up to two digits.
 
 ``--write`` makes the recording of that seed with its limit (``check.yaml``) and a README.md that
-says all this. ``--out`` writes mean, deviation and standard error of all metrics as JSON.
+says all this; with ``--keep SEED`` the recording that is there stays, whose seed it names.
+``--out`` writes mean, deviation and standard error of all metrics as JSON.
 ``--seed`` begins the runs, ``--set`` changes the scene.
 """
 
@@ -53,15 +54,19 @@ SHOWN = ('of the seed', 'median', '5 %', '95 %')
 
 @frozen
 class Typical:
-    """seed: whose errors are in the middle; limit: for `check`; spread: of each metric."""
+    """seed: whose errors are in the middle, or that is kept; rank: of its first error, 1 the
+    smallest; limit: for `check`; spread: of each metric."""
 
     seed: int
+    rank: int
     limit: float
     spread: dict[str, dict[str, float]]
 
 
-def typical(outcomes: Sequence[Outcome], metrics: Sequence[str]) -> Typical:
-    """The typical one of runs; the first of the metrics has the limit.
+def typical(
+    outcomes: Sequence[Outcome], metrics: Sequence[str], keep: int | None = None
+) -> Typical:
+    """The typical one of runs, or the seed to `keep`; the first of the metrics has the limit.
 
     Raises ValueError when a metric is missing in more than half of the runs.
     """
@@ -74,7 +79,9 @@ def typical(outcomes: Sequence[Outcome], metrics: Sequence[str]) -> Typical:
     rank = np.argsort(np.argsort(error, axis=0, kind='stable'), axis=0)
     off = np.abs(rank - (len(runs) - 1) // 2)
     # The worst rank decides, then the sum of all, then the first metric.
-    best = np.lexsort((off[:, 0], off.sum(axis=1), off.max(axis=1)))[0]
+    best = int(np.lexsort((off[:, 0], off.sum(axis=1), off.max(axis=1)))[0])
+    if keep is not None:
+        best = [run.seed for run in runs].index(keep)
     spread = {}
     for name, column in zip(metrics, error.T):
         finite = column[np.isfinite(column)]
@@ -89,7 +96,8 @@ def typical(outcomes: Sequence[Outcome], metrics: Sequence[str]) -> Typical:
             'worst': float(finite.max()),
             'runs': float(len(finite)),
         }
-    return Typical(runs[best].seed, rounded_up(spread[metrics[0]][f'{100 * SHARE:.0f} %']), spread)
+    limit = rounded_up(spread[metrics[0]][f'{100 * SHARE:.0f} %'])
+    return Typical(runs[best].seed, int(rank[best, 0]) + 1, limit, spread)
 
 
 def rounded_up(value: float, digits: int = 2) -> float:
@@ -121,6 +129,7 @@ def readme(given: argparse.Namespace, found: Typical, limit: Limit, failed: int)
     again += [text for pair in given.set for text in ('--set', pair)]
     again += [text for metric in given.metric for text in ('--metric', metric)]
     again += [*given.compress, '--write', f'bags/{name}']
+    again += [] if given.keep is None else ['--keep', str(given.keep)]
     first = next(iter(found.spread))
     what = limit.meaning if first == limit.metric else f'`{first}`'
     shown = {
@@ -132,9 +141,8 @@ def readme(given: argparse.Namespace, found: Typical, limit: Limit, failed: int)
             '',
             f'    {" ".join(command)}',
             '',
-            f'Of seeds {given.seed} to {given.seed + given.runs - 1} the middle one by '
-            + (f'{what}.' if len(shown) == 1 else 'all errors below.')
-            + (f' {failed} runs failed.' if failed else ''),
+            f'Number {found.rank} of seeds {given.seed} to {given.seed + given.runs - 1} by '
+            f'{what}, the smallest first.' + (f' {failed} runs failed.' if failed else ''),
             f'`sonar-imm check {given.system}` allows {found.limit:g} {limit.unit}; '
             f'{100 * SHARE:.0f} % of these runs stay below.',
             '',
@@ -162,11 +170,12 @@ def outcomes_of(given: argparse.Namespace, plan: Plan) -> list[Outcome]:
 def write(given: argparse.Namespace, found: Typical, text: str) -> None:
     """Make the recording, its limit and README.md, in place of those there are."""
     folder = Path(given.write)
-    if folder.exists():
-        shutil.rmtree(folder)
-    status = sonar_imm(['simulate', given.system, str(folder), *simulated(given, found.seed)])
-    if status:
-        sys.exit(status)
+    if given.keep is None:
+        if folder.exists():
+            shutil.rmtree(folder)
+        status = sonar_imm(['simulate', given.system, str(folder), *simulated(given, found.seed)])
+        if status:
+            sys.exit(status)
     write_own_limit(folder, found.limit, simulated(given, found.seed))
     (folder / 'README.md').write_text(text, encoding='utf-8')
 
@@ -185,6 +194,12 @@ def main() -> None:
     parser.add_argument('--out', type=Path, help='write the summary of all metrics here, as JSON')
     parser.add_argument('--write', type=Path, metavar='BAG', help='make the recording here')
     parser.add_argument(
+        '--keep',
+        type=int,
+        metavar='SEED',
+        help='the recording of --write stays; it is of this seed',
+    )
+    parser.add_argument(
         '--compress', action='store_const', const=['--compress'], default=[], help='the recording'
     )
     given = parser.parse_args()
@@ -196,7 +211,7 @@ def main() -> None:
     write_json(given.out, record(plan, outcomes))
     failed = [outcome for outcome in outcomes if outcome.failure]
     try:
-        found = typical(outcomes, given.metric)
+        found = typical(outcomes, given.metric, given.keep)
     except ValueError as error:
         reasons = sorted({outcome.failure for outcome in failed})
         sys.exit(' '.join([str(error), *reasons]))

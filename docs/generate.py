@@ -45,8 +45,8 @@ YAML_HEAD = """\
 MARKDOWN = """\
 # Parameters of the {what}
 
-{summary}. `config/{name}.yaml` holds all of them with their ranges, ready to copy.
-Those with a star may change while the node runs. [Types of values](nodes.md).
+{summary}. `config/{name}.yaml` has all with their ranges, ready to copy.
+A star: may change while the node runs. [Types of values](nodes.md).
 
 ## The ten that matter
 

@@ -75,6 +75,12 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """Called by mkdocs with each page: links to notebooks, which lie beside docs/, lead to their
+    pages."""
+    return re.sub(r'\]\(\.\./((?:\.\./)*examples/\w+)\.ipynb\)', r'](\1.md)', markdown)
+
+
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
     """Called by mkdocs with each page as HTML: cells know the head of their column."""
     return re.sub(r'<table>.*?</table>', labelled, html, flags=re.DOTALL)

@@ -373,14 +373,13 @@ def write_geo(estimate: Estimate, row: int, origin: Origin, make: Make) -> Any:
     """
     names = [name for name in ('px', 'py', 'pz') if name in estimate.state_names]
     index = [estimate.state_names.index(name) for name in names]
-    enu = np.zeros(3)
-    enu[2] = estimate.xyz[row, 2]
-    enu[: len(index)] = estimate.state[row, index]
+    where = estimate.state[row, index]
     covariance = np.diag([0.0, 0.0, UNKNOWN_VARIANCE])
     covariance[: len(index), : len(index)] = estimate.covariance[row][np.ix_(index, index)]
-    place = origin.geodetic(enu)
+    flat = len(index) < 3
+    place = origin.at_height(where, estimate.xyz[row, 2]) if flat else origin.geodetic(where)
     turn = origin.turn(place[0], place[1]).T
-    if len(index) < 3:
+    if flat:
         place[2] = np.nan
     return _navsat(
         estimate.stamp_ns,

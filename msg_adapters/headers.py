@@ -145,7 +145,8 @@ def to_enu(measurement: M, world_frame: str, turned: Callable[[M], M]) -> M:
         raise Rejection(
             'frame_ned',
             f"the frame '{measurement.frame_id}' is north-east-down but "
-            'east-north-up is expected; set the world frame to ned',
+            'east-north-up is expected; set world_frame_convention: ned',
+            ('world_frame_convention',),
         )
     return measurement
 

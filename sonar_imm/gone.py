@@ -96,8 +96,13 @@ GONE: dict[str, str] = {
             *('ground_std', 'ground_radius', 'max_offset', 'altitude_std'),
             *('max_altitude_age', 'scale_std', 'course_window', 'landmark_time'),
             'max_navigation_gap',
-            *('sigma_reference_bin', 'grid_step', 'grid_extent'),
-            *('initial_slope_std', 'redrawn_slope_std', 'multipath_level_db', 'likelihood'),
+            *(
+                'sigma_reference_bin',
+                'initial_slope_std',
+                'redrawn_slope_std',
+                'multipath_level_db',
+                'likelihood',
+            ),
             *('initial_mean', 'initial_std'),
             'max_extrapolation',
             *('array_depth_age', 'heave_memory', 'white_noise_gain_db', 'depth_step'),
@@ -143,6 +148,10 @@ GONE: dict[str, str] = {
         for name in ('height_bank', 'scatter_bank')
     },
     'parameter engine': 'was removed: each set has one (parameter model_set)',
+    **{
+        f'parameter grid_{name}': 'was removed: no model set runs on a grid (parameter model_set)'
+        for name in ('step', 'extent')
+    },
     'parameter shadow_gate': 'was removed: 1 is no gate (parameter gate_false_alarm)',
     **{
         f'parameter {name}': 'was removed: terrain, the default, has models of rough floor'

@@ -67,8 +67,9 @@ class NodeConfig(Config):
 
 
 @frozen(kw_only=True)
-class BathymetryNodeConfig(NodeConfig):
-    """A swath is looked at while it is surveyed, and no ping needs the one before."""
+class BathymetryNodeConfig(OriginParameters, NodeConfig):
+    """A swath is looked at while it is surveyed, and no ping needs the one before. Besides, where
+    the frame of the navigation lies on Earth, for charts."""
 
     # fmt: off
     max_wait: float = inherited(NodeConfig, 'max_wait', 0.5)

@@ -90,8 +90,6 @@ HEADER = """\
 """
 LONGEST = 600
 """Lines of a file that is one idea, the licence not counted."""
-LONGER = {'sonar_imm/trackers/bathymetry/grid_kernels.py'}
-"""All that an engine compiles, with what it calls: a kernel file imports no other."""
 
 
 @pytest.fixture(scope='module')
@@ -251,7 +249,7 @@ def test_files_begin_with_the_licence_and_are_not_too_long() -> None:
         name: len(text.removeprefix(HEADER).strip().splitlines())
         for name, text in texts_of.items()
     }
-    assert {name for name, lines in lengths.items() if lines > LONGEST} == LONGER
+    assert not {name for name, lines in lengths.items() if lines > LONGEST}
 
 
 def test_generated_files_are_up_to_date() -> None:
@@ -371,7 +369,7 @@ def test_the_examples_of_the_library_run(capsys: pytest.CaptureFixture[str]) -> 
         exec(compile(example, 'library.md', 'exec'), {})
         assert capsys.readouterr().out
     lines = [line for line in examples[0].splitlines() if line.strip()]
-    assert len(examples) == 3 and len(lines) <= 10
+    assert len(examples) == 4 and len(lines) <= 10
 
 
 def texts(manifest: ElementTree.Element, tag: str) -> set[str]:

@@ -77,7 +77,10 @@ def test_the_api_has_every_public_module(made: Any) -> None:
 def test_files_and_tests_named_on_pages_exist() -> None:
     files = [
         path.relative_to(ROOT)
-        for room in ('sonar_imm', 'sonar_imm_tools', 'msg_adapters', 'test', 'benchmarks', 'docs')
+        for room in (
+            *('sonar_imm', 'sonar_imm_tools', 'msg_adapters', 'test'),
+            *('benchmarks', 'docs', 'examples'),
+        )
         for path in (ROOT / room).rglob('*.py')
     ]
     sources = [
@@ -102,6 +105,37 @@ def test_links_of_pages_from_the_root_lead_to_pages(made: Any, name: str) -> Non
     for target in re.findall(r'\]\(([^)#]+)', text):
         known = target in made.OUTSIDE.values() or (ROOT / 'docs' / target).is_file()
         assert '://' in target or known, target
+
+
+def slug(heading: str) -> str:
+    """The anchor of a heading."""
+    words = re.sub(r'\[([^\]]*)\]\([^)]*\)', r'\1', heading).strip().lower()
+    return re.sub(r'[^\w\- ]', '', words).replace(' ', '-')
+
+
+def test_links_between_files_lead_somewhere() -> None:
+    pages = {
+        path: re.sub(r'^```.*?^```', '', path.read_text(encoding='utf-8'), flags=re.M | re.S)
+        for path in [*ROOT.glob('*.md'), *(ROOT / 'docs').rglob('*.md')]
+    }
+    anchors = {
+        path: {slug(heading) for heading in re.findall(r'^#+ (.*)$', text, re.M)}
+        for path, text in pages.items()
+    }
+    broken = set()
+    for path, text in pages.items():
+        for link in re.findall(r'\]\((?!\w+:)([^)\s]+)\)', text):
+            name, _, anchor = link.partition('#')
+            target = (path.parent / name).resolve() if name else path
+            if not target.exists() or (anchor and anchor not in anchors.get(target, {anchor})):
+                broken.add(f'{path.name}: {link}')
+    assert broken == set()
+
+
+def test_links_to_notebooks_lead_to_their_pages(made: Any) -> None:
+    text = '[a](../../examples/own_data.ipynb), [b](../runs.md)'
+    shown = made.on_page_markdown(text, None, None, None)
+    assert shown == '[a](../examples/own_data.md), [b](../runs.md)'
 
 
 def test_what_comes_from_another_server_is_seen(made: Any) -> None:

@@ -307,8 +307,9 @@ def _staves(
     if (np.abs(phase) > least[:, 1])[live].any():
         place = np.arange(staves)[among]
         wide = math.sqrt(np.square(place - place.mean()).sum())
-        # The line that was taken off is that of phases as large as those that are left.
-        size = math.sqrt(np.square(phase[among]).sum() / max(len(place) - 2, 1))
+        # The line that was taken off is that of phases as large as those that are left: Student's
+        # law of n - 2 degrees of freedom has a variance (n - 2) / (n - 4) times theirs.
+        size = math.sqrt(np.square(phase[among]).sum() / max(len(place) - 4, 1))
         sine_std = size / (2.0 * math.pi * abs(spacing) * wide)
     else:
         phase = np.zeros(staves)

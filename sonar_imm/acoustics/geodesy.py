@@ -23,6 +23,11 @@ from ..estimation.arrays import FloatArray
 
 NEAR_ZERO = 1e-4
 """Degrees; both of a position below it are the place of receivers without a fix."""
+EARTH_RADIUS = 6.371e6
+EXACT = 1e-3
+"""Metres to which a height is met."""
+MOST_STEPS = 8
+"""Of the search for it; 2 suffice within 100 km, 5 within 1000 km."""
 
 
 @frozen
@@ -34,8 +39,10 @@ class Origin:
     longitude: float
     height: float = 0.0
 
-    def local(self, latitude: float, longitude: float, height: float = 0.0) -> FloatArray:
-        """East, north, up (3,) in metres of a place in degrees and metres."""
+    def local(
+        self, latitude: float | FloatArray, longitude: float | FloatArray, height: float = 0.0
+    ) -> FloatArray:
+        """East, north, up (3,) or (3, n) in metres of one place or n in degrees and metres."""
         from pymap3d import geodetic2enu  # only needed for latitudes
 
         return np.array(
@@ -51,10 +58,36 @@ class Origin:
         there = enu2geodetic(east, north, up, self.latitude, self.longitude, self.height)
         return np.stack([np.asarray(part, np.float64) for part in there], axis=-1)
 
+    def at_height(self, places: FloatArray, above: float | FloatArray = 0.0) -> FloatArray:
+        """Return latitude, longitude in degrees and height in metres (..., 3) of places (..., 2).
+
+        The places are metres east and north in the plane of the origin. They lie `above` the
+        height of the origin along the ellipsoid, not in that plane, which is 785 m higher 100 km
+        away: its own latitude and longitude there are 12 m nearer to the origin. NaN for places
+        farther than the Earth's radius.
+        """
+        places = np.asarray(places, np.float64)
+        radius = EARTH_RADIUS + self.height
+        squared = np.square(places).sum(axis=-1)
+        up = above + np.sqrt(np.maximum(radius**2 - squared, 0.0)) - radius
+        for _ in range(MOST_STEPS):
+            found = self.geodetic(np.concatenate([places, up[..., None]], axis=-1))
+            miss = self.height + above - found[..., 2]
+            if not np.abs(miss).max(initial=0.0) > EXACT:
+                break
+            up = up + miss
+        found[np.abs(miss) > EXACT] = np.nan
+        return found
+
     def degrees(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Longitude and latitude (n,) of places (n, 2), metres east and north at height 0."""
-        latitude, longitude, _ = self.geodetic(np.pad(places, ((0, 0), (0, 1)))).T
-        return longitude, latitude
+        """Longitude and latitude (n,) of places (n, 2 or 3), metres east, north and up; at the
+        height of the origin (`at_height`) where up is NaN or missing."""
+        places = np.asarray(places, np.float64)
+        found = self.at_height(places[:, :2])
+        if places.shape[1] == 3:
+            known = np.isfinite(places[:, 2])
+            found[known] = self.geodetic(places[known])
+        return found[:, 1], found[:, 0]
 
     def axes(self, latitude: float, longitude: float) -> FloatArray:
         """(3, 3) that turns vectors in east, north, up of a place into those of the origin: the

@@ -292,7 +292,10 @@ class IMM:
             raise ValueError('a step needs a measurement model, here or in the filter')
         unknown = [name for name in sensor.components if name not in self.outputs]
         if unknown:
-            raise ValueError(f"'{unknown[0]}' is measured, but no model has it")
+            raise ValueError(
+                f"'{unknown[0]}' is measured, but no model has it: name what is measured in "
+                'MeasurementModel(h, R, components)'
+            )
         if z.shape != (len(sensor.R),) or not np.isfinite(z).all():
             raise ValueError(f'z needs {len(sensor.R)} finite values, or None; got {z}')
         return z, sensor

@@ -63,7 +63,7 @@ __all__ = [
     'write_state',
 ]
 
-FORMAT = 7
+FORMAT = 8
 """Counts up when a tracker keeps other numbers than before."""
 _MAGIC = b'sonar_imm state '
 _LARGEST = 1 << 30

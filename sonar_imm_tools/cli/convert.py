@@ -307,6 +307,7 @@ def _what(messages: dict[str, int]) -> str:
 
 
 def _print(report: ConversionReport) -> None:
+    from ..evaluation.numbers import counted
     from ..recordings.reader import BagReader
     from ..recordings.topics import ready_systems
 
@@ -319,7 +320,7 @@ def _print(report: ConversionReport) -> None:
         say(f'  question: {question}')
     if report.bad_rows:
         why = ', '.join(f'{count} {reason}' for reason, count in report.reasons.most_common())
-        say(f'  {report.bad_rows} rows left out' + (f', of them {why}' if why else ''))
+        say(f'  {counted(report.bad_rows, "row")} left out' + (f', of them {why}' if why else ''))
     with BagReader(report.path) as bag:
         for system in ready_systems(bag)[:1]:
             say(f'to track it: {track_line(str(report.path), system, {})}')

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import click
 
-from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.files import whole
 
 from .common import example, json_option, place_options, print_json, say
@@ -131,7 +130,13 @@ Told = tuple[dict[str, Any], str]
 
 def _export_soundings(asked: _Asked, cell: float) -> Told:
     from ..offline.run_folder import RUN
-    from ..recordings.export.points import read_points, write_las, write_table, write_xyz
+    from ..recordings.export.points import (
+        origin_of,
+        read_points,
+        write_las,
+        write_table,
+        write_xyz,
+    )
     from ..recordings.sources import BagError
     from ..survey.chart import chart_of, OF_ONE_RUN, write_geotiff
     from ..survey.line import budget_of, unstated, without_far
@@ -141,7 +146,8 @@ def _export_soundings(asked: _Asked, cell: float) -> Told:
             f'{asked.run} holds no soundings: the recording has no navigation, or is of another '
             'system'
         )
-    whole_run = read_points(place).moved(asked.origin)
+    own = origin_of(asked.record, asked.run)
+    whole_run = read_points(place).placed(own, asked.epsg, asked.origin)
     points = without_far(whole_run)
     result: dict[str, Any] = {'soundings': len(points)}
     shape = ''
@@ -191,8 +197,8 @@ def _export_map(asked: _Asked) -> Told:
 
 
 def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
-    """Longitude and latitude (n,) of places (n, 2) in metres from the origin; None where nobody
-    says it."""
+    """Longitude and latitude (n,) of places (n, 2 or 3) in metres from the origin; None where
+    nobody says it."""
     if asked.epsg is None:
         return None
     import numpy as np
@@ -200,22 +206,19 @@ def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
     from ..recordings.export.points import degrees_of
 
     epsg, shift = asked.epsg, np.array(asked.origin[:2])
-    return lambda places: degrees_of(places + shift, epsg)
+    return lambda places: degrees_of(places[:, :2] + shift, epsg)
 
 
 def _export_tracks(asked: _Asked) -> Told:
     """Tracks of a run of divers or obstacles."""
+    from ..evaluation.numbers import counted
+    from ..recordings.export.points import origin_of
     from ..recordings.export.tracks import tracks_of, write_tracks
-    from ..recordings.sources import BagError, names_of_targets, TARGET_NAMES
+    from ..recordings.sources import names_of_targets, TARGET_NAMES
 
     degrees = _to_degrees(asked)
-    if degrees is None and (stated := asked.record.get('origin')):
-        try:
-            numbers = {name: float(value) for name, value in stated.items()}
-            degrees = Origin(**numbers).degrees
-        except (AttributeError, TypeError, ValueError, OverflowError):
-            sentence = f"'origin' in the run.json of {asked.run} cannot be understood"
-            raise BagError(sentence) from None
+    if degrees is None and (own := origin_of(asked.record, asked.run)) is not None:
+        degrees = own.degrees
     names = names_of_targets(asked.record.get(TARGET_NAMES))
     tracks = tracks_of(asked.folder.read_estimates(), degrees, names)
     with whole(asked.out) as unfinished:
@@ -223,7 +226,7 @@ def _export_tracks(asked: _Asked) -> Told:
     count = sum(1 for _ in tracks.each())
     left = f', {left_out} left out that have no place on Earth' if left_out else ''
     result = {'rows': len(tracks), 'left_out': left_out, 'tracks': count}
-    return result, f'{count} tracks, {len(tracks)} rows{left}'
+    return result, f'{counted(count, "track")}, {counted(len(tracks), "row")}{left}'
 
 
 def _export_horizons(asked: _Asked, original: Path | None) -> Told:

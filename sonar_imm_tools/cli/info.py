@@ -88,6 +88,7 @@ def track_line(bag: str, system: str, named: dict[str, str], missing: Sequence[s
 
     words = [f'--topic {quoted(f"{name}={topic}")}' for name, topic in named.items()]
     for name in missing:
-        words.append(f'--set {name}={"DEGREES" if name.endswith("_deg") else "METRES"}')
+        unit = 'DEGREES' if name.endswith('_deg') else 'METRES'
+        words.append(f'--set {name}={"ned" if name == "world_frame_convention" else unit}')
     path = f'./{bag}' if bag.startswith('-') else bag
     return ' '.join([f'sonar-imm track {quoted(path)} OUT_DIR --system {system}', *words])

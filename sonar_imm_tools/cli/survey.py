@@ -93,7 +93,7 @@ def command(
     from ..offline.run_folder import require_parquet
     from ..recordings.export.points import wkt_of
     from ..survey.jobs import Options
-    from ..survey.making import epsg_of, make, Progress, sources_of
+    from ..survey.making import epsg_of, frame_of, make, Progress, sources_of
     from ..survey.products import folder_of, write
 
     require_parquet()
@@ -102,7 +102,12 @@ def command(
     if number:
         wkt_of(number)
     options = Options(
-        resolution=resolution, adjusted=adjusted, fixed=fixed, epsg=number, origin=origin
+        resolution=resolution,
+        adjusted=adjusted,
+        fixed=fixed,
+        epsg=number,
+        origin=origin,
+        frame=frame_of(sources),
     )
     with folder_of(out, options, runs, resume=resume, overwrite=overwrite) as place:
         with (

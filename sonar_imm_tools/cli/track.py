@@ -27,6 +27,7 @@ from .common import (
     json_option,
     load_config,
     load_detector,
+    parameters_taken,
     params_option,
     print_json,
     progress,
@@ -38,6 +39,8 @@ from .common import (
 )
 
 if TYPE_CHECKING:
+    from sonar_imm.acoustics.geodesy import Origin
+
     from ..offline.batch import Job, Outcome
     from ..offline.initial import Initial
     from ..recordings.own_files import OwnParameters
@@ -223,6 +226,19 @@ class Plan:
 
         return self.params if self.params is not None else own_parameters(bag)
 
+    def _origin(self, bag: Path, system: System) -> Origin | None:
+        """Where the frame of a recording lies on Earth by its own file, which counts beside
+        --params where it is only exported."""
+        from sonar_imm.node_config import node_config_type
+
+        from ..recordings.own_files import own_parameters
+
+        node = node_config_type(system)
+        if all(spec.name != 'origin' for spec in node.specs()):  # a parameter of the tracker
+            return None
+        taken = parameters_taken(system, own_parameters(bag))
+        return node.from_mapping({k: taken[k] for k in ('origin',) if k in taken}).stated_origin()
+
     def jobs(
         self, bag: Path, folder: Path, note: Callable[[str], object] = lambda sentence: None
     ) -> list[Job]:
@@ -243,6 +259,7 @@ class Plan:
         params = self.parameters_of(bag)
         overrides = self._overrides(system)
         config, node = load_config(system, params, overrides)
+        origin = node.stated_origin() or self._origin(bag, system)
         places = self._initial(system)
         detector = load_detector(system, params, overrides)
         several = len(found) > 1
@@ -258,7 +275,7 @@ class Plan:
                     order=self.order,
                     frame_id=node.frame_id,
                     world_frame=node.world_frame_convention,
-                    origin=node.stated_origin(),
+                    origin=origin,
                     smooth=self.smooth,
                     initial=places,
                     detector=detector,

@@ -232,7 +232,7 @@ def _stamp_problems(found: _Found) -> list[str]:
 def _content_problems(found: _Found) -> list[str]:
     """Problems of messages; refusals only for the input that the topic suits or is named after."""
     problems = []
-    if len(found.frames) > 1:
+    if len(found.frames) > 1 and ('diver', 'relative') not in found.good:  # there names of targets
         problems.append(f'several frames: {", ".join(map(repr, found.frames))}')
     for key, reasons in found.refused.items():
         if key in found.good or found.topic.name.split('/')[-1] == key[1]:

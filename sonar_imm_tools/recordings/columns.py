@@ -88,8 +88,8 @@ USUAL_NAMES = {
         'horizontal_range horizontal_distance ground_range'
     ),
     'std_range': 'sigma_range range_std',
-    'forward': 'ahead fwd rel_forward',
-    'starboard': 'stbd rel_starboard',
+    'forward': 'ahead fwd rel_forward voraus vorwaerts avant adelante frente forover foran forut',
+    'starboard': 'stbd rel_starboard steuerbord tribord estribor estibordo boreste styrbord',
     'vessel_x': '',
     'vessel_y': '',
     'vessel_latitude': '',
@@ -115,7 +115,8 @@ USUAL_NAMES = {
     'status': 'fix_status position_status zustand etat statut estado',
     'tag': (
         'tag_id transmitter transmitter_id tx tx_id full_id tagname tag_name '
-        'acoustic_tag_id signal'
+        'acoustic_tag_id signal sender sender_id sendernummer emetteur transmisor transmissor '
+        'marca marque merke'
     ),
     'code_space': 'codespace transmitter_codespace tag_code_space',
     'ping': 'ping_id ping_number',

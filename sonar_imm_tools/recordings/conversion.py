@@ -255,13 +255,15 @@ def write_bag(
     storage: str = 'mcap',
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     streams: Mapping[str, Sequence[int]] | None = None,
+    needed: str = '',
 ) -> ConversionReport:
     """Write `records` in time order into a new bag at `out`; log time = stamp. Those whose clock
     is off for itself are left out and counted.
 
     parameters: those of its instruments, by the names of nodes; streams: stamps in the order in
-    which each clock of the file said them, by default those of each topic. Raises `BagError`
-    when there is nothing to write or the bag cannot be made.
+    which each clock of the file said them, by default those of each topic; needed: a topic without
+    which the others are of no use. Raises `BagError` when there is nothing to write or the bag
+    cannot be made.
     """
     # Bytes take less room than messages.
     packed = [
@@ -275,7 +277,7 @@ def write_bag(
     off = _wrong_stamps(streams, source, report)
     kept = (record for record in packed if record[0] not in off)
     ordered = sorted(kept, key=lambda record: record[0])
-    if not ordered:
+    if not ordered or (needed and all(topic != needed for _, topic, *_ in ordered)):
         raise report.nothing(source)
     notes = provenance(source, report.notes)
     if named := {str(number): name for name, number in report.target_names.items()}:

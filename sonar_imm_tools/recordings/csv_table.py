@@ -32,6 +32,8 @@ RECORDS = 'VEMCO DATA LOG'
 class CsvTable(Table):
     """The header of a CSV file and an iterator over its rows. Raises `BagError` for no CSV."""
 
+    UNITS_ARE_FREE = True
+
     def __init__(self, path: str | Path, options: CsvOptions | None = None):
         self.path = Path(path)
         self.options = options or CsvOptions()

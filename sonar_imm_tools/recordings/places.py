@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import suppress
 import math
 import re
@@ -53,6 +54,9 @@ FARTHEST_APART = 5.0
 """Metres that metres and degrees of the same rows may differ by, beside a tenth of the way."""
 NEAR_ORIGIN = 1e5
 """Metres from a stated origin that positions are within."""
+LEAST_ROWS, SLOWEST = 5, 2e-4
+"""Rows by which units are judged; a speed in degrees a second, of 22 m/s, which in metres no
+measured position has."""
 _AXES = ('latitude', 'longitude')
 
 
@@ -85,6 +89,7 @@ class Degrees:
             for axis in _AXES
         }
         latitude, longitude = (np.abs(values[axis]) for axis in _AXES)
+        self._ask_for_radians(table, latitude, longitude)
         limits = (latitude, 90.0), (longitude, 360.0)
         beyond = [len(each) and 2.0 * np.mean(each > limit) > 1.0 for each, limit in limits]
         if beyond[0] and latitude.max() <= 180.0 and (longitude <= 90.0).all():
@@ -92,6 +97,21 @@ class Degrees:
         self.packed = any(beyond) and all(
             (each % 100.0 < 60.0).all() and (each < 100.0 * limit).all() for each, limit in limits
         )
+
+    def _ask_for_radians(self, table: Table, latitude: FloatArray, longitude: FloatArray) -> None:
+        """Raise `BagError` where degrees without a unit may be radians, or lie off Africa."""
+        north, east = self._names.values()
+        stated = any(unit_of(table.with_unit(name)) for name in (north, east))
+        few = min(len(latitude), len(longitude)) < LEAST_ROWS
+        if not table.UNITS_ARE_FREE or stated or few or self._signs['latitude']:
+            return
+        small = latitude.max() <= 0.5 * math.pi and longitude.max() <= math.pi
+        if small and latitude.max() > NEAR_ZERO:
+            raise BagError(
+                f'{table.path}: {table.header(north)} and {table.header(east)} may be degrees or '
+                f'radians, such as {latitude[0]:.6g}; write {north}_deg or {north}_rad in the '
+                'header'
+            )
 
     def _exchanged(self, table: Table, why: str) -> BagError:
         north, east = (table.header(name) for name in self._names.values())
@@ -242,6 +262,8 @@ class LocalFrame:
             table.require('x', 'y')
         if metres and table.has('latitude', 'longitude') and not self.geodetic:
             _ask_for_places(table)
+        if not self.geodetic:
+            _ask_for_degrees(table)
         self.origin = checked_origin(origin) if self.geodetic else None
         self._degrees = Degrees(table) if self.geodetic else None
         if self._degrees is not None and self.origin is not None:
@@ -310,6 +332,30 @@ def _ask_for_places(table: Table) -> None:
         )
 
 
+def _ask_for_degrees(table: Table) -> None:
+    """Raise `BagError` where x and y without a unit move as longitude and latitude do."""
+    if any(unit_of(table.with_unit(name)) or name in table.options.columns for name in 'xy'):
+        return
+    rows = []
+    for row in table.first_rows:
+        with suppress(BadRow, BagError):
+            rows.append((row.stamp_ns() * 1e-9, row.number('x'), row.number('y')))
+    if len(rows) < LEAST_ROWS or not table.UNITS_ARE_FREE:
+        return
+    places = np.array(rows)
+    steps = np.diff(places, axis=0)
+    speed = np.hypot(*steps[steps[:, 0] > 0.0, 1:].T) / steps[steps[:, 0] > 0.0, 0]
+    moving = speed[speed > 0.0]
+    on_earth = (np.abs(places[:, 1:]) <= (180.0, 90.0)).all()
+    if on_earth and len(moving) >= LEAST_ROWS and np.median(moving) < SLOWEST:
+        x, y = table.header('x'), table.header('y')
+        raise BagError(
+            f'{table.path}: {x} and {y}, such as {places[0, 1]:.7g}, {places[0, 2]:.7g}, move by '
+            f'{np.median(moving):.2g} a second, as degrees do; say --column longitude={x} '
+            f'--column latitude={y}, or for metres --column x={x} --column y={y}'
+        )
+
+
 def origin_parameters(origin: tuple[float, ...] | None) -> dict[str, list[float]]:
     """Give an origin as the tracker's parameter; nothing for metres."""
     return {} if origin is None else {'origin': list(origin)}
@@ -328,7 +374,8 @@ def checked_origin(origin: tuple[float, ...] | None) -> tuple[float, float, floa
 BEARINGS = ('bow', 'north', 'east')
 """Where bearings count from: clockwise from the bow or from north, counter-clockwise from east."""
 RANGES = ('', 'slant', 'horizontal')
-_TURN = 6.3
+TURN = 6.3
+"""Radians; beyond it angles can only be degrees."""
 _LEAST, _SHARE = 1.0, 0.05
 """A depth matters where a slant range and a horizontal one differ by more: m, share of it."""
 
@@ -406,7 +453,7 @@ class PolarRows:
         distance, bearing = row.number('range'), row.number('bearing')
         if distance < 0.0:
             raise BadRow(f'{row.table.header("range")} is {distance:g}, a negative distance')
-        if abs(bearing) * self._unit > 2.0 * _TURN:
+        if abs(bearing) * self._unit > 2.0 * TURN:
             raise BadRow(f'{row.table.header("bearing")} is {bearing:g}, more than two turns')
         self._largest = max(self._largest, abs(bearing))
         slant, height = distance, row.height() if self._slant else 0.0
@@ -427,9 +474,15 @@ class PolarRows:
 
     def check_unit(self) -> None:
         """Raise `BagError` where neither the header nor the bearings say degrees or radians."""
-        header = self._table.header('bearing')
-        if not unit_of(self._table.with_unit('bearing')) and 0.0 < self._largest <= _TURN:
-            raise BagError(
-                f'{self._table.path}: {header} may be degrees or radians, none is beyond '
-                f'{self._largest:.3g}; write bearing_deg or bearing_rad in the header'
-            )
+        ask_for_angle(self._table, 'bearing', [self._largest])
+
+
+def ask_for_angle(table: Table, name: str, values: Iterable[float]) -> None:
+    """Raise `BagError` where neither the header of an angle nor its values, of which those that
+    are NaN do not count, say degrees or radians."""
+    largest = max((abs(value) for value in values if not math.isnan(value)), default=0.0)
+    if table.has(name) and not unit_of(table.with_unit(name)) and 0.0 < largest <= TURN:
+        raise BagError(
+            f'{table.path}: {table.header(name)} may be degrees or radians, none is beyond '
+            f'{largest:.3g}; write {name}_deg or {name}_rad in the header'
+        )

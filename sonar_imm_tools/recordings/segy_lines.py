@@ -136,7 +136,7 @@ def read_segy(
             return SegyLine(
                 clock.stamps(file, questions),
                 np.asarray(file.trace.raw[:], np.float64),
-                _intervals(file, header),
+                _intervals(file, header, questions),
                 _delays(file, problems),
                 *_places(file, header, crs, problems),
                 np.maximum(_scaled(depth, file.attributes(fields.ElevationScalar)[:]), 0.0),
@@ -231,7 +231,7 @@ def _order_of_su(path: Path, header: bytes) -> str:
     raise BagError(f'{path} cannot be read: it is damaged or no SU file')
 
 
-def _intervals(file: segyio.SegyFile, header: bytes) -> FloatArray:
+def _intervals(file: segyio.SegyFile, header: bytes, questions: list[str]) -> FloatArray:
     """Return the sample interval (T,) of each trace, s, else that of the file."""
     import segyio
 
@@ -242,6 +242,12 @@ def _intervals(file: segyio.SegyFile, header: bytes) -> FloatArray:
     # The revision is two words of one byte, of which the greater is the major one.
     if max(header[300:302], default=0) >= 2 and 0.0 < exact[0] < 1e6:
         return np.full(len(own), 1e-6 * exact[0])
+    if whole and (own > 0).all() and not (own == whole).any():
+        questions.append(
+            f'the sample interval is {own[0]:g} us in the trace headers and {whole:g} us in that '
+            f'of the file; the first is used. Of the other, depths are {whole / own[0]:.3g} times '
+            'as large (--sample-spacing)'
+        )
     return 1e-6 * np.where(own > 0, own, whole)
 
 

@@ -22,6 +22,7 @@ import itertools
 import math
 from pathlib import Path
 import re
+from typing import ClassVar
 
 from attrs import frozen
 
@@ -50,9 +51,11 @@ from .times import (
     dated,
     DAYS,
     form_of,
+    GPS,
     HHMMSS,
     hhmmss,
     moment_ns,
+    of_gps_ns,
     ORDERS,
     orders_of,
     split_time,
@@ -101,8 +104,8 @@ class CsvOptions:
     time_unit: str = option('', 'UNIT',
         'Unit of numeric times in {what}: s, ms, us, ns, min, h or d; HHMMSS for a time of day in '
         'one number; days of MATLAB (datenum), a spreadsheet (excel), or the Julian calendar '
-        '(julian, mjd).',
-        choices=('', *TIME_UNITS, HHMMSS, *DAYS))
+        '(julian, mjd); seconds of GPS time (gps).',
+        choices=('', *TIME_UNITS, HHMMSS, *DAYS, GPS))
     date_order: str = option('', 'ORDER',
         'Order of day, month and year in dates such as 05/06/24 in {what}.',
         choices=('', *ORDERS))
@@ -115,7 +118,7 @@ class CsvOptions:
     # fmt: on
 
     def __attrs_post_init__(self) -> None:
-        units = (*TIME_UNITS, HHMMSS, *DAYS)
+        units = (*TIME_UNITS, HHMMSS, *DAYS, GPS)
         if self.time_unit not in ('', *units):
             raise BagError(
                 f"the time unit must be one of {', '.join(units)}, got '{self.time_unit}'"
@@ -227,6 +230,8 @@ class Row:
         stamp = moment_ns(self._moment(name), lambda: self._zone(name))
         if stamp is None:
             stamp = self.seconds_ns(name)
+            if self.table.time_form(name) == GPS:
+                stamp = of_gps_ns(stamp)
             if 0 <= stamp <= 86400 * 10**9 and self.table.has('date') and name == 'stamp':
                 order = self.table.date_order('date')
                 day = dated(self.text('date'), '00:00', self.table.header('date'), order)
@@ -312,6 +317,8 @@ class Table:
     """Named columns and an iterator over the rows of a file of any kind."""
 
     delimiter = ','
+    UNITS_ARE_FREE: ClassVar = False
+    """Whether the kind of file leaves open what unit latitudes and x have."""
 
     def __init__(self, path: str | Path, options: CsvOptions | None, headers: Sequence[str]):
         self.path = Path(path)
@@ -470,7 +477,7 @@ class Table:
         name of `DAYS`. Raises `BagError` where that is not clear."""
         if name not in self.forms:
             unit = self.time_unit(name) or DAY_NAMES.get(name_of(self.header(name)), '')
-            form = unit if unit in (HHMMSS, *DAYS) else ''
+            form = unit if unit in (HHMMSS, *DAYS, GPS) else ''
             if not unit and name in self.index:
                 cells = self.first_cells(self.index[name])
                 form = form_of(self.header(name), cells, self.has('date'))

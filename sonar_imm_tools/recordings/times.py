@@ -36,7 +36,7 @@ _MONTHS = (
 )  # fmt: skip
 """How the names of the months begin."""
 
-HHMMSS = 'HHMMSS'
+HHMMSS, GPS = 'HHMMSS', 'gps'
 DAYS = {
     'datenum': Decimal(719529), 'excel': Decimal(25569), 'julian': Decimal('2440587.5'),
     'mjd': Decimal(40587),
@@ -57,6 +57,8 @@ LEAPS = (
 """Seconds since 1970 at which a leap second was inserted since 1980; none is planned."""
 GPS_EPOCH = 315964800
 """1980-01-06, in seconds since 1970."""
+LEAST_EPOCH = 1e8
+"""Seconds; fewer are counted from the start of a recording."""
 
 
 def gps_minus_utc(seconds: FloatArray | IntArray) -> IntArray:
@@ -65,6 +67,14 @@ def gps_minus_utc(seconds: FloatArray | IntArray) -> IntArray:
     Source: IERS Bulletin C.
     """
     return np.searchsorted(np.array(LEAPS), seconds, side='right')
+
+
+def of_gps_ns(nanoseconds: int) -> int:
+    """Return nanoseconds since 1970 of those of GPS time."""
+    since_1970 = nanoseconds + GPS_EPOCH * 10**9
+    seconds = np.array([since_1970 // 10**9])
+    leaps = int(gps_minus_utc(seconds - gps_minus_utc(seconds))[0])
+    return since_1970 - leaps * 10**9
 
 
 class BadRow(ValueError):
@@ -217,6 +227,11 @@ def form_of(header: str, cells: Sequence[str], with_date: bool) -> str:
     numbers = [cell.replace(',', '.') for cell in cells if _DIGITS.match(cell)]
     if not numbers or len(numbers) < len(cells):
         return ''
+    if 'gps' in plain(header).split('_') and min(map(float, numbers)) > LEAST_EPOCH:
+        raise BagError(
+            f'{header} holds numbers such as {cells[0]}, which may be seconds of GPS time, since '
+            '1980, or seconds since 1970; say --time-unit gps or --time-unit s'
+        )
     clocks, values = [hhmmss(cell) for cell in numbers], [float(cell) for cell in numbers]
     widths = {len(cell.partition('.')[0]) for cell in numbers}
     if all(clocks) and (max(widths) > 4 if with_date else widths == {6} or widths == {5, 6}):

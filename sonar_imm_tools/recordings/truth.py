@@ -105,6 +105,11 @@ def _records(
             velocity = difference_velocity(stamps, position[:, :2])
         records += records_of(TrueTrack(track_id, stamps, position, velocity), frame_id)
     report.notes.update(frame.notes())
+    if origin is not None and not frame.geodetic:
+        report.notes['truth'] = (
+            f'x and y of {table.path.name} count from latitude {origin[0]:g}, longitude '
+            f'{origin[1]:g}; from another place: --origin LAT,LON'
+        )
     report.notes['truth_velocity'] = 'stated' if with_velocity else 'central differences'
     return records
 

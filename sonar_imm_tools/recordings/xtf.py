@@ -39,33 +39,44 @@ def pings_in(path: Path, report: ConversionReport, units: str) -> Iterator[dict[
     """Yield the pings of `pings_of`, with places in `units` where these are stated.
 
     :param units: 'degrees', 'metres', or 'auto' for those of the file.
-    :raises BagError: the file says metres, and its places can only be degrees.
+    :raises BagError: the file does not say the unit, or its places cannot be of the one it says.
     """
     pings = pings_of(path, report)
     first = list(islice(pings, PLACES_READ)) if units == 'auto' else []
-    where = [ping for ping in first if ping['units'] == 'metres' and ping['stamp_ns'] >= 0]
-    if len(where) > 1:
-        place = np.array([ping['place'] for ping in where], np.float64)
-        seconds = np.diff([ping['stamp_ns'] for ping in where]) * 1e-9
-        steps = np.hypot(*np.diff(place, axis=0).T)[seconds > 0.0] / seconds[seconds > 0.0]
-        on_earth = (np.abs(place) <= (180.0, 90.0)).all()
-        if on_earth and len(steps) and 0.0 < np.median(steps) < SLOWEST:
-            raise BagError(
-                f'{path}: the file says that its places are metres; they are such as '
-                f'{place[0, 0]:.7g}, {place[0, 1]:.7g} and move by {np.median(steps):.2g} a '
-                'second, as degrees do; say --units degrees or --units metres'
-            )
+    where = [ping for ping in first if ping['units'] and ping['stamp_ns'] >= 0]
+    if where and (why := _doubted_unit(where)):
+        raise BagError(f'{path}: {why}; say --units degrees or --units metres')
     for ping in chain(first, pings):
         stated = ping['units'] and units != 'auto'
         yield {**ping, 'units': units} if stated else ping
+
+
+def _doubted_unit(pings: list[dict[str, Any]]) -> str:
+    """Say why the places of pings may be of another unit than the file says; empty if not."""
+    unit, place = pings[0]['units'], np.array([ping['place'] for ping in pings], np.float64)
+    on_earth = (np.abs(place) <= (180.0, 90.0)).all(axis=1)
+    such = f'such as {place[0, 0]:.7g}, {place[0, 1]:.7g}'
+    if unit not in UNITS.values():
+        return f'the file does not say the unit of its places, {such}'
+    if unit == 'degrees':
+        beyond = 2 * on_earth.sum() < len(place)
+        return f'the file says that its places are degrees, and they are {such}' if beyond else ''
+    seconds = np.diff([ping['stamp_ns'] for ping in pings]) * 1e-9
+    steps = np.hypot(*np.diff(place, axis=0).T)[seconds > 0.0] / seconds[seconds > 0.0]
+    if not (on_earth.all() and len(steps) and 0.0 < np.median(steps) < SLOWEST):
+        return ''
+    return (
+        f'the file says that its places are metres; they are {such} and move by '
+        f'{np.median(steps):.2g} a second, as degrees do'
+    )
 
 
 def pings_of(path: Path, report: ConversionReport) -> Iterator[dict[str, Any]]:
     """The pings of a file: where (its word), stamp_ns (-1 for none), channels (dicts of side,
     name, samples, slant_range m, delay s, frequency Hz), soundings (n, 3), metres east and north
     of the place and depth below the surface, None in a ping of side scan; sound_speed m/s, place
-    (x, y) in degrees or metres as units says, layback m from there to the sonar, heading, pitch,
-    roll in degrees, depth, altitude m.
+    (x, y) in degrees or metres as units says, empty without a place, layback m from there to the
+    sonar, heading, pitch, roll in degrees, depth, altitude m.
 
     The report is told what ended a file early, and what was not taken. Raises `BagError` without
     pyxtf."""
@@ -154,8 +165,8 @@ def _ping(head: Any, content: bytes, pyxtf: Any) -> dict[str, Any]:
     except (ValueError, OverflowError):
         stamp_ns = -1
     place = packet.SensorXcoordinate, packet.SensorYcoordinate
-    if of_ship := not any(place):
-        place = packet.ShipXcoordinate, packet.ShipYcoordinate
+    ship = packet.ShipXcoordinate, packet.ShipYcoordinate
+    place = place if any(place) else ship
     return {
         'stamp_ns': stamp_ns,
         'channels': channels,
@@ -163,9 +174,9 @@ def _ping(head: Any, content: bytes, pyxtf: Any) -> dict[str, Any]:
         # Half the speed of sound is what many programs write there.
         'sound_speed': packet.SoundVelocity * (2.0 if packet.SoundVelocity < 1000.0 else 1.0),
         # Who has no position leaves it at zero.
-        'units': UNITS.get(head.NavUnits, '') if any(place) else '',
+        'units': UNITS.get(head.NavUnits, 'unknown') if any(place) else '',
         'place': place,
-        'layback': float(packet.Layback) if of_ship else 0.0,
+        'layback': float(packet.Layback) if place == ship else 0.0,
         'heading': packet.SensorHeading or packet.ShipGyro,
         'pitch': packet.SensorPitch,
         'roll': packet.SensorRoll,

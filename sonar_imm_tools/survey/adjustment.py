@@ -106,8 +106,9 @@ class Adjustment:
     group: IntArray
 
     def known_share(self) -> FloatArray:
-        """`told` of each unknown (P,): the share of the prior variance that is gone."""
-        return np.asarray(1.0 - np.square(self.std / self.prior_std))
+        """`told` of each unknown (P,): the share of the prior variance that is gone, 0 where
+        misties leave more than the prior."""
+        return np.maximum(1.0 - np.square(self.std / self.prior_std), 0.0)
 
     def of_lines(self, lines: Sequence[int]) -> FloatArray:
         """Covariance (L, 6, L, 6) of the total corrections of some lines."""

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 import math
 from pathlib import Path
 from typing import Any
+import warnings
 
 from attrs import frozen
 import numpy as np
@@ -112,6 +113,7 @@ def write_geotiff(
     Needs rasterio. Raises `BagError` for an unknown EPSG number.
     """
     import rasterio
+    from rasterio.errors import NotGeoreferencedWarning
     from rasterio.transform import from_origin
 
     rows, columns = chart.shape
@@ -133,12 +135,15 @@ def write_geotiff(
             file.write(chart.bands[name].astype(np.float32), number)
             file.set_band_description(number, name)
 
-    if str(path).isprintable():
-        with rasterio.open(path, 'w', **options) as file:
-            fill(file)
-        return
-    # The library names only files whose names are UTF-8.
-    with rasterio.MemoryFile() as memory:
-        with memory.open(**options) as file:
-            fill(file)
-        path.write_bytes(memory.read())
+    with warnings.catch_warnings():
+        # Cells of 1 m from the origin are kept, whatever this warning says.
+        warnings.simplefilter('ignore', NotGeoreferencedWarning)
+        if str(path).isprintable():
+            with rasterio.open(path, 'w', **options) as file:
+                fill(file)
+            return
+        # The library names only files whose names are UTF-8.
+        with rasterio.MemoryFile() as memory:
+            with memory.open(**options) as file:
+                fill(file)
+            path.write_bytes(memory.read())

@@ -22,16 +22,17 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from attrs import asdict, evolve, frozen
+from attrs import asdict, astuple, evolve, frozen
 import numpy as np
 
 from sonar_imm import __version__
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.sounding import ErrorBudget
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.files import whole
 
 from ..offline.run_folder import fingerprint, finite
-from ..recordings.export.points import read_points
+from ..recordings.export.points import origin_of, read_points
 from ..recordings.sources import BagError
 from ..recordings.writer import naming
 from .grid import grid_of_looks, HALO, Soundings
@@ -51,13 +52,16 @@ _STORED = dict.fromkeys(('D', 'Y', 'noise', 'geometry', 'speed', 'port'), 'f4') 
 @frozen(kw_only=True)
 class Options:
     """What is asked for. resolution: cell in m, 0: by depth. epsg: 0 for none. origin (3,): map
-    coordinates of the origin of the navigation. fixed: names of lines whose tide is known."""
+    coordinates of the origin of the navigation. frame: latitude, longitude and height of the
+    origin that the first line with one states, None for none. fixed: names of lines whose tide is
+    known."""
 
     resolution: float = 0.0
     adjusted: bool = False
     fixed: tuple[str, ...] = ()
     epsg: int = 0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    frame: tuple[float, float, float] | None = None
 
 
 @frozen(kw_only=True)
@@ -116,9 +120,17 @@ def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]
     content, are those of before. Raises `BagError`."""
     size, mtime_ns = _stat(source.table)
     budget, sound_speed = budget_of(source.run)
+    own, frame = origin_of(source.run, source.name), options.frame
+    if own is None and frame and not any(options.origin):
+        raise BagError(
+            f'other lines state where their frame lies on Earth (origin) and {source.name} does '
+            'not: track it with --set origin=[LATITUDE,LONGITUDE,HEIGHT]'
+        )
     wanted = {
         'version': __version__,
         'origin': list(options.origin),
+        'epsg': options.epsg,
+        'frames': [own and list(astuple(own)), frame and list(frame)],
         'budget': [*asdict(budget).values(), sound_speed],
     }
     known = _known_line(place)
@@ -128,7 +140,9 @@ def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]
             return dict(known['info'])
         if known['info']['sha256'] == fingerprint(source.table)['bag_sha256']:
             return dict(known['info'])
-    points = read_points(source.table).moved(options.origin)
+    points = read_points(source.table).placed(
+        own, options.epsg, options.origin, frame and Origin(*frame)
+    )
     if not len(points):
         raise BagError(f'{source.table} has no soundings')
     used = ('x', 'y', 'z', 'vertical_uncertainty', 'range', 'beam_angle', 'side')

@@ -16,6 +16,7 @@ ended, changes no byte.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 import hashlib
 import math
 import os
@@ -35,7 +36,7 @@ from ..evaluation.numbers import counted
 from ..offline.jobs import Run
 from ..offline.run_folder import BAG, CSV, PARQUET, RUN, RunFolder, SOUNDINGS
 from ..offline.run_folder import KIND as RESULTS
-from ..recordings.export.points import TOPIC, topics_of_soundings
+from ..recordings.export.points import origin_of, TOPIC, topics_of_soundings
 from ..recordings.reader import BagReader
 from ..recordings.sources import BagError, is_recording
 from .adjustment import Adjustment
@@ -156,6 +157,15 @@ def epsg_of(sources: Sequence[Source], given: int) -> int:
                 'one coordinate system'
             )
     return known[0][0] if known else 0
+
+
+def frame_of(sources: Sequence[Source]) -> tuple[float, float, float] | None:
+    """Return the first origin that a run states, None for none."""
+    for source in sources:
+        with suppress(BagError):  # of a damaged line, which is left out by name
+            if (first := origin_of(source.run, source.name)) is not None:
+                return first.latitude, first.longitude, first.height
+    return None
 
 
 # -- which tiles there are ----------------------------------------------------------------------

@@ -315,7 +315,8 @@ def write_report(out: Path, survey: Survey, chart: Chart, content: Mapping[str, 
 def page(survey: Survey, chart: Chart, content: Mapping[str, Any]) -> str:
     """The page as text; the same survey gives the same bytes."""
     parts = [
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Survey</title>',
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width"><title>Survey</title>',
         f'<style>{STYLE}</style><script>{plotly.offline.get_plotlyjs()}</script></head><body>',
         f'<h1>Survey</h1><p>{_summary(survey, chart)}</p>',
         *(f'<p><strong>{_escaped(sentence)}</strong></p>' for sentence in survey.warnings),
@@ -333,7 +334,7 @@ def page(survey: Survey, chart: Chart, content: Mapping[str, Any]) -> str:
         ),
         (
             'Competing depths',
-            'Where other soundings, two or more, say another depth: how much deeper it would be.',
+            'Where two or more soundings contradict the depth: how much deeper they are.',
             _image(chart, competing - seen['depth'], thin, 'deeper by [m]', 'RdBu'),
         ),
         (
@@ -457,11 +458,12 @@ def _corrections(content: Mapping[str, Any]) -> list[str]:
     ]
     weak = [(f'{100.0 * e["share"]:.1f} %', e['combination']) for e in content['not_told'][:20]]
     return [
-        '<h2>Corrections</h2><p>True less reported; <em>told</em> is the share of the prior '
-        'variance that the lines took away.</p>',
-        _table(('of', 'correction', 'value', 'sd', 'told'), rows),
-        '<h2>What could not be told</h2><p>Combinations of corrections, in units of their priors, '
-        'of which the lines say less than the prior does, and what is left of its variance.</p>',
+        '<h2>Corrections</h2><p>True less reported. Determined: share of the prior variance '
+        'that the lines removed.</p>',
+        _table(('of', 'correction', 'value', 'sd', 'determined'), rows),
+        '<h2>Not determined</h2><p>Combinations of corrections, in units of their priors, that '
+        'the lines determine less than the prior does, and the share of its variance that is '
+        'left.</p>',
         _table(('left', 'combination'), weak),
     ]
 

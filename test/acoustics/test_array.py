@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from sonar_imm.acoustics import array
-from sonar_imm.trackers.bathymetry import grid_kernels
 
 TILT = math.radians(30.0)
 
@@ -63,14 +62,6 @@ def test_conjugation_turns_the_phase_round():
     assert straight.shape == (7, 5)
     assert np.allclose(turned, straight.conj()) and np.allclose(turned, straight[::-1])
     assert array.phase_step(0.4) == -array.phase_step(0.4, conjugate=True) == 0.8 * math.pi
-
-
-def test_the_compiled_sines_are_those_of_numpy():
-    D, out = np.linspace(-50.0, 50.0, 301), np.empty(301)
-    grid_kernels.direction_sines(D, 40.0, math.cos(TILT), math.sin(TILT), out)
-    expected = array.direction_sine(D, 40.0, TILT)
-    assert np.array_equal(np.isnan(out), np.isnan(expected)) and np.isnan(out).any()
-    assert np.allclose(out, expected, atol=1e-15, equal_nan=True)
 
 
 def test_the_mirror_of_the_surface():

@@ -60,7 +60,7 @@ def test_gain_phase_and_what_is_live_are_those_of_the_vectors():
             assert each.gain[live] == pytest.approx(true[live], rel=0.025)
             assert each.coherence[live].min() > 0.97 and each.coherence[~live].max() < 0.35
             # The vectors have the root mean square, here it is that of phases beside a line.
-            tilt = float(case['phase_tilt']) * math.sqrt(7.0 / 5.0)
+            tilt = float(case['phase_tilt']) * math.sqrt(7.0 / 3.0)
             assert each.sine_std == pytest.approx(tilt, rel=0.03)
         # To the reach of the vectors, of three pings.
         assert np.mean([c.gain[live] for c in found], axis=0) == pytest.approx(
@@ -93,7 +93,7 @@ def test_gains_and_phases_are_measured_and_taken_off():
     turned = np.median(np.abs(found.apply(iq * gain * np.exp(1j * phase))) / np.abs(iq), axis=0)
     assert turned == pytest.approx(1.0, rel=0.02)
     wide = 2.0 * math.pi * 0.5 * math.sqrt(42.0)
-    assert found.sine_std == pytest.approx(math.sqrt(np.sum(found.phase**2) / 6.0) / wide)
+    assert found.sine_std == pytest.approx(math.sqrt(np.sum(found.phase**2) / 4.0) / wide)
 
 
 def test_a_phase_that_grows_evenly_is_a_tilt_and_stays():

@@ -78,3 +78,23 @@ def test_axes_turn_with_the_place():
     assert turn @ turn.T == pytest.approx(np.eye(3), abs=1e-12)
     # The meridians converge: what is east there points a little north here.
     assert math.degrees(math.atan2(turn[1, 0], turn[0, 0])) == pytest.approx(0.257, abs=0.005)
+
+
+@pytest.mark.parametrize('place', PLACES)
+def test_a_place_without_height_lies_on_the_ellipsoid_and_not_in_the_plane(place):
+    """In the plane 100 km away: 785 m above the ellipsoid, 12 m too near to the origin."""
+    origin = Origin(*place)
+    there, expected = [], []
+    for north, east in ((0.0, 0.0), (0.9, 0.2), (-0.3, 1.1), (6.0, -4.0)):
+        latitude, longitude = place[0] + north, place[1] + east
+        step = earth(latitude, longitude, place[2] - 3.0) - earth(*place)
+        there.append((numeric_axes(*place).T @ step)[:2])
+        expected.append(earth(latitude, longitude, place[2] - 3.0))
+    found = origin.at_height(np.array(there), -3.0)
+    assert [earth(*each) for each in found] == [pytest.approx(e, abs=0.01) for e in expected]
+    assert found[:, 2] == pytest.approx(place[2] - 3.0, abs=1e-3)
+    longitude, latitude = origin.degrees(np.array([[*there[1], np.nan], [1e5, 0.0, -785.0]]))
+    assert latitude[0] == pytest.approx(found[1, 0], abs=1e-6)
+    assert [latitude[1], longitude[1]] == pytest.approx(origin.geodetic([1e5, 0.0, -785.0])[:2])
+    assert origin.at_height(np.array([3.0, 4.0])).shape == (3,)
+    assert np.isnan(origin.at_height(np.array([[1e7, 0.0]]))).all()

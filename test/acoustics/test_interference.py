@@ -8,10 +8,10 @@
 
 import numpy as np
 from oracles.array_likelihood import interfered_log_likelihood, log_likelihood
+from oracles.bin_likelihood import log_likelihoods
 import pytest
 
 from sonar_imm.acoustics import array, interference, laplace
-from sonar_imm.trackers.bathymetry import grid_kernels
 
 STAVES, SPACING = 8, 0.5
 STEP = array.phase_step(SPACING)
@@ -38,15 +38,14 @@ def test_the_covariance_is_the_sum_of_its_parts(scene):
 
 
 @pytest.mark.parametrize('likelihood', laplace.LIKELIHOODS)
-def test_the_compiled_likelihood_is_that_of_linear_algebra(scene, likelihood):
+def test_the_likelihood_by_its_parts_is_that_of_linear_algebra(scene, likelihood):
     y, covariance = scene
     form = interference.interference_form(y, covariance)
     u, signal = np.append(np.linspace(-1.0, 1.0, 41), np.nan), 7.0
-    out = np.empty(len(u))
     for n in range(3):
-        grid_kernels.log_likelihoods(
+        out = log_likelihoods(
             u, SPACING, -signal * form.beam[n], form.base[n], form.spread[n], signal,
-            laplace.likelihood_table(STAVES, likelihood), np.empty((4, len(u))), out,
+            laplace.likelihood_table(STAVES, likelihood),
         )  # fmt: skip
         expected = interfered_log_likelihood(u, y[n], signal, covariance[n], STEP, likelihood)
         assert out[-1] == expected[-1] == -np.inf

@@ -10,12 +10,12 @@ import math
 
 import numpy as np
 from oracles.array_likelihood import gaussian_log_density, log_likelihood
+from oracles.bin_likelihood import log_densities, log_likelihoods
 import pytest
 from scipy.integrate import quad
 from scipy.special import kve
 
 from sonar_imm.acoustics import array, laplace
-from sonar_imm.trackers.bathymetry import grid_kernels
 
 STEP = array.phase_step(0.5)
 
@@ -126,10 +126,7 @@ def test_the_form_is_that_of_the_covariance(staves):
 @pytest.mark.parametrize('staves', [2, 3, 4, 8, 16, 64])
 def test_the_table_is_the_likelihood(staves, likelihood):
     q = np.geomspace(2.0**-20, 2.0**49.99, 20_000)
-    out = np.empty(len(q))
-    grid_kernels.log_densities(
-        q.copy(), np.empty(len(q)), laplace.likelihood_table(staves, likelihood), out
-    )
+    out = log_densities(q, laplace.likelihood_table(staves, likelihood))
     if likelihood == 'gaussian':
         assert np.allclose(out, -q, rtol=1e-12)
         return
@@ -141,9 +138,8 @@ def test_the_table_is_the_likelihood(staves, likelihood):
 
 
 def test_what_the_table_does_not_reach_is_held_at_its_end():
-    table, out = laplace.likelihood_table(8), np.empty(5)
-    q = np.array([0.0, -1.0, 1e-30, np.nan, 1e300])
-    grid_kernels.log_densities(q.copy(), np.empty(5), table, out)
+    table = laplace.likelihood_table(8)
+    out = log_densities(np.array([0.0, -1.0, 1e-30, np.nan, 1e300]), table)
     assert (out[:4] == out[0]).all() and np.isfinite(out).all() and out[4] < -1e7
     for staves, likelihood in ((1, 'laplace'), (65, 'laplace'), (8, 'cauchy')):
         with pytest.raises(ValueError):
@@ -153,14 +149,13 @@ def test_what_the_table_does_not_reach_is_held_at_its_end():
 
 @pytest.mark.parametrize('likelihood', laplace.LIKELIHOODS)
 @pytest.mark.parametrize('staves, spacing', [(2, 0.5), (5, 0.3), (8, 0.5), (8, -0.5), (64, 0.5)])
-def test_the_compiled_likelihood_is_that_of_numpy(staves, spacing, likelihood):
+def test_the_likelihood_by_its_parts_is_that_of_the_definition(staves, spacing, likelihood):
     rng = np.random.default_rng(2)
     u = np.append(rng.uniform(-1.0, 1.0, 300), [np.nan, 1.0, -1.0])
     y, signal, noise = 3.0 * complex_normal(rng, staves), 40.0, 0.7
-    out = np.empty(len(u))
-    grid_kernels.log_likelihoods(
+    out = log_likelihoods(
         u, spacing, laplace.form_coefficients(y, signal, noise), 0.0, np.empty(0, complex), 0.0,
-        laplace.likelihood_table(staves, likelihood), np.empty((4, len(u))), out,
+        laplace.likelihood_table(staves, likelihood),
     )  # fmt: skip
     expected = log_likelihood(u, y, signal, noise, 2.0 * math.pi * spacing, likelihood)
     assert out[300] == expected[300] == -np.inf

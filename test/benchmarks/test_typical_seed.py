@@ -43,9 +43,13 @@ def test_a_run_without_the_error_is_worse_than_any_and_most_must_have_it():
 def test_the_text_names_the_command_the_seeds_and_the_limit():
     given = Namespace(
         system='diver', scene='table1', runs=5, seed=1, set=['speed=2'],
-        metric=['position.rmse_m'], compress=[], write='somewhere/diver_table1',
+        metric=['position.rmse_m'], compress=[], keep=None, write='somewhere/diver_table1',
     )  # fmt: skip
     found = typical(outcomes(**{'position.rmse_m': [5.0, 1.0, 3.0, 2.0, 4.0]}), given.metric)
     text = readme(given, found, Limit(1.0, 'm', 'position RMSE', 'position.rmse_m'), 0)
     assert 'simulate diver bags/diver_table1 --scenario table1 --seed 3 --set speed=2' in text
-    assert 'Of seeds 1 to 5' in text and 'allows 4.6 m' in text and 'somewhere' not in text
+    assert (
+        'Number 3 of seeds 1 to 5' in text and 'allows 4.6 m' in text and 'somewhere' not in text
+    )
+    kept = typical(outcomes(**{'position.rmse_m': [5.0, 1.0, 3.0, 2.0, 4.0]}), given.metric, 5)
+    assert (kept.seed, kept.rank, kept.limit) == (5, 4, found.limit)

@@ -14,15 +14,17 @@ import os
 import re
 import shutil
 
+from attrs import asdict
 from helpers.clusters import small_cluster
 from helpers.commands import run
 import numpy as np
 import pytest
 
 from msg_adapters.soundings import write_soundings
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.soundings import COLUMNS, Soundings
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm_tools.recordings.export.points import read_points, write_table
+from sonar_imm_tools.recordings.export.points import places_of, read_points, write_table
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 from sonar_imm_tools.survey import adjustment, jobs, resuming
 from sonar_imm_tools.survey.making import plan_tiles
@@ -193,7 +195,7 @@ def test_the_page_shows_chart_misties_and_what_is_not_known(made):
     page = (made / 'report.html').read_text(encoding='utf-8')
     for words in ('<h2>Depth', '<h2>Uncertainty', '<h2>Competing depths', '<h2>Misties'):
         assert words in page
-    assert page.count('Plotly.newPlot(') >= 4 and 'What could not be told' in page
+    assert page.count('Plotly.newPlot(') >= 4 and '<h2>Not determined</h2>' in page
     assert '4 lines with' in page and 'roll_deg' in page and 'offset_m line_000' in page
     assert not re.search(r'<(script|link)[^>]+(src|href)=', page)  # nothing from elsewhere
 
@@ -352,6 +354,37 @@ def test_a_broken_line_is_named_and_the_rest_is_made(lines, tmp_path, capsys):
     adjustment = json.loads((tmp_path / 'out' / 'adjustment.json').read_text())
     # Without --adjust the misties are part of the uncertainty.
     assert np.nanmin(bands['uncertainty']) > adjustment['crossings']['rms_before']
+
+
+def test_lines_with_origins_of_their_own_lie_in_one_frame(lines, made, tmp_path, capsys):
+    """Each line in metres from its own first position, as lines in latitude and longitude are."""
+    earth = Origin(54.3, 10.15)
+    for k, line in enumerate(sorted(lines.glob('line_*'))):
+        own = Origin(*(np.array([54.3, 10.15]) + (0.002 * k, -0.003 * k)))
+        points = read_points(line / 'soundings.csv').placed(earth, None, (0.0, 0.0, 0.0), own)
+        folder = tmp_path / 'runs' / line.name
+        folder.mkdir(parents=True)
+        write_table(folder / 'soundings.csv', points)
+        (folder / 'run.json').write_text(json.dumps({**RECORD, 'origin': asdict(own)}))
+    runs, out = tmp_path / 'runs', tmp_path / 'out'
+    assert run('survey', runs, out, '--resolution', 2) == 0
+    assert run('survey', lines, tmp_path / 'same', '--resolution', 2) == 0
+    depth, wanted = (read(each / 'survey.tif')[0]['depth'] for each in (out, tmp_path / 'same'))
+    assert np.nanmedian(np.abs(depth - wanted)) < 0.01
+
+    assert run('survey', runs, tmp_path / 'utm', '--resolution', 2, '--crs', 25832) == 0
+    _, transform, file = read(tmp_path / 'utm' / 'survey.tif')
+    assert file.crs.to_epsg() == 25832
+    east, north = places_of(np.array([10.15]), np.array([54.3]), 25832)
+    corner = (
+        transform.c + file.width * transform.a / 2,
+        transform.f + file.height * transform.e / 2,
+    )
+    assert abs(corner[0] - east[0]) < 300.0 and abs(corner[1] - north[0]) < 300.0
+
+    (runs / 'line_001' / 'run.json').write_text(json.dumps(RECORD))
+    assert run('survey', runs, tmp_path / 'third', '--resolution', 2) == 0
+    assert 'line_001: other lines state where' in capsys.readouterr().err
 
 
 def test_groups_that_do_not_overlap_are_adjusted_with_a_warning(lines, tmp_path, capsys):

@@ -167,25 +167,25 @@ def test_a_processor_that_was_chosen_stays():
     assert subprocess.check_output(words, env=environment, text=True) == 'skylake none\n'
 
 
-def test_a_helper_that_changes_changes_the_result(tmp_path):
-    """`walk` calls another kernel of its file, where the chance to stay is changed."""
+def test_a_constant_that_changes_changes_the_result(tmp_path):
+    """`normals` has ln 2 from its file, which a numba that looks at the kernel alone forgets."""
     root, cache = tmp_path / 'copy', tmp_path / 'cache'
     shutil.copytree(PACKAGE, root / 'sonar_imm', ignore=shutil.ignore_patterns('__pycache__'))
     code = """
 import numpy as np
 from sonar_imm.estimation.jit import counts
-from sonar_imm.trackers.bathymetry.grid_kernels import walk
-source, out = np.eye(1, 9, 4)[0], np.empty(9)
-walk(source, 0, 9, 0.3, np.empty((7, 144)), out, 0, 9)
-print(round(out[4], 4), 'loaded' if counts()[1] else 'compiled')
+from sonar_imm.trackers.bathymetry.filter_kernels import normals
+uniform, out = np.array([0.5, 0.0]), np.empty(2)
+normals(uniform, uniform.view(np.int64), out, out.view(np.int64))
+print(round(out[0], 4), 'loaded' if counts()[1] else 'compiled')
 """
-    assert run(code, cache, root=root)[0].split() == ['0.91', 'compiled']
-    assert run(code, cache, root=root)[0].split() == ['0.91', 'loaded']
-    file = root / 'sonar_imm/trackers/bathymetry/grid_kernels.py'
+    assert run(code, cache, root=root)[0].split() == ['1.1774', 'compiled']
+    assert run(code, cache, root=root)[0].split() == ['1.1774', 'loaded']
+    file = root / 'sonar_imm/trackers/bathymetry/filter_kernels.py'
     text = file.read_text()
-    assert text.count('= 1.0 - sigma * sigma,') == 1
-    file.write_text(text.replace('= 1.0 - sigma * sigma,', '= 1.0 - 2.0 * sigma * sigma,'))
-    assert run(code, cache, root=root)[0].split() == ['0.82', 'compiled']
+    assert text.count('LN_2 = math.sqrt(2.0), math.log(2.0)') == 1
+    file.write_text(text.replace('math.log(2.0)\nMANTISSA', '4.0 * math.log(2.0)\nMANTISSA'))
+    assert run(code, cache, root=root)[0].split() == ['2.3548', 'compiled']
 
 
 def test_of_processes_that_begin_at_once_one_compiles(tmp_path):

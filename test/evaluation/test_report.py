@@ -133,6 +133,12 @@ def test_without_truth_the_stated_uncertainty_is_shown():
     assert 'Error, and the predicted error' not in page.headings
 
 
+def test_warnings_of_the_tracker_are_shown_and_truth_only_where_there_is_one():
+    text = html(part(truth=False, warnings=['fix covariances <small>']))
+    assert '<li>fix covariances &lt;small&gt;</li>' in text and 'Dotted' not in text
+    assert 'Dotted: truth' in html(part()) and '<h2>Warnings' not in html(part())
+
+
 def test_several_runs_have_a_front_page_and_a_page_each(tmp_path):
     failed = [Check('bytes', 'other', 'equal', False), Check('end', '0', '0', True)]
     parts = [part(), part(bag='/data/other.bag', checks=failed), part(bag='/data/other.bag')]

@@ -364,6 +364,8 @@ def test_an_estimate_is_written_as_navsatfix_and_read_back():
 
 def test_without_depth_the_altitude_is_not_a_number():
     message = write_geo(estimate(), 0, Origin(59.0, 10.0), ros_message)
+    place = Origin(59.0, 10.0).at_height(np.array([1000.0, 2000.0]), estimate().xyz[0, 2])
+    assert [message.latitude, message.longitude] == pytest.approx(place[:2], abs=1e-12)
     assert np.isnan(message.altitude)
     assert message.position_covariance[8] > 1e5 and message.position_covariance_type == 3
     assert message.position_covariance[0] == pytest.approx(1.1, abs=1e-3)

@@ -14,10 +14,13 @@ import numpy as np
 import pytest
 
 from msg_adapters.arrivals import write_arrivals
+from msg_adapters.detections import write_detections
 from msg_adapters.fixes import write_fix
-from sonar_imm.measurements import Arrivals, Fix
+from msg_adapters.navigation import write_navigation
+from sonar_imm.measurements import Arrivals, Detections, Fix, Navigation
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.offline.inspection import inspect
+from sonar_imm_tools.recordings.convert import convert_relative
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
@@ -98,6 +101,33 @@ def test_two_pings_of_one_stamp_are_a_problem(tmp_path):
 def test_several_frames_are_told(tmp_path):
     _, topics = found(write_fixes(tmp_path / 'bag', range(4), frames=('map', 'odom')))
     assert "several frames: 'map', 'odom'" in topics['/fix']['problems']
+
+
+def test_frames_of_relative_fixes_are_names_of_targets(tmp_path):
+    table = tmp_path / 'usbl.csv'
+    rows = ''.join(f'{k},1,2,90,10,2,{name}\n' for k in range(3) for name in ('amy', 'rov'))
+    table.write_text('stamp,vessel_x,vessel_y,heading,forward,starboard,id\n' + rows)
+    convert_relative(table, tmp_path / 'bag')
+    _, topics = found(tmp_path / 'bag')
+    assert topics['/relative']['frames'] == ['amy', 'rov']
+    assert topics['/relative']['problems'] == []
+
+
+def test_navigation_in_ned_is_an_input_that_needs_a_parameter(tmp_path, capsys):
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k in range(3):
+            stamp_ns = START_NS + k * 10**9
+            ping = Detections(stamp_ns=stamp_ns, frame_id='sonar', range=[20.0], bearing=[0.1])
+            pose = Navigation(
+                stamp_ns=stamp_ns,
+                position=[k, 0, 5],
+                orientation=[0, 0, 0, 1],
+                frame_id='odom_ned',
+            )
+            bag.write('/detections', write_detections(ping, ros_message), stamp_ns)
+            bag.write('/odometry', write_navigation(pose, ros_message), stamp_ns)
+    assert main(['info', str(tmp_path / 'bag')]) == 0
+    assert '--system obstacle --set world_frame_convention=ned' in capsys.readouterr().out
 
 
 def test_what_no_tracker_knows_suits_nothing(tmp_path):

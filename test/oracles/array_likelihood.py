@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Likelihoods of a direction from their definitions, for `trackers.bathymetry.grid_kernels`."""
+"""Likelihoods of a direction from their definitions."""
 
 import numpy as np
 from numpy.typing import ArrayLike

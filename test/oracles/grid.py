@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The filter and smoother of `trackers.bathymetry.grid_kernels` in numpy, over all cells."""
+"""The filter of one state on a grid: exact, but for the width of a cell."""
 
 from __future__ import annotations
 
@@ -15,44 +15,37 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.trackers.bathymetry.grid_kernels import NARROW
 
 
 class Filtered(NamedTuple):
-    """density (T, M, G), joint over models and cells at each step; log_likelihood (T,) of each
-    measurement given those before it."""
+    """Mean (T,) and variance (T,) of the state at each bin, probability (T, M) of the models, and
+    the logarithm (T,) of its likelihood given the bins before it."""
 
-    density: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+    probability: FloatArray
     log_likelihood: FloatArray
 
 
-def walk_matrix(cells: int, sigma: float) -> FloatArray:
-    """W[h, g] (G, G), the probability of going from cell h to g, `sigma` in
-    cells. Rows far from the ends sum to one; near them probability leaves the grid."""
-    if not sigma > 0.0:
-        return np.eye(cells)
-    lag = np.arange(cells)
-    if sigma < NARROW:
-        row = np.where(lag == 0, 1.0 - sigma**2, np.where(lag == 1, 0.5 * sigma**2, 0.0))
-        return np.asarray(row[np.abs(lag[:, None] - lag)])
-    row = np.exp(-0.5 * (lag / sigma) ** 2)
-    return np.asarray(row[np.abs(lag[:, None] - lag)] / (2.0 * row.sum() - 1.0))
-
-
-def filter_densities(
-    start: FloatArray, transition: FloatArray, sigma: FloatArray, log_likelihood: FloatArray
+def filtered(
+    cells: FloatArray,
+    start: tuple[float, float],
+    sigma: FloatArray,
+    transition: FloatArray,
+    initial: FloatArray,
+    log_likelihood: FloatArray,
 ) -> Filtered:
-    """Filter T steps. start (M, G) before the first step; sigma (T, M) in cells;
-    log_likelihood (T, G)."""
-    T, G = log_likelihood.shape
-    density, log_sums = np.empty((T, *start.shape)), np.empty(T)
-    p = start
-    for t in range(T):
-        mixed = transition.T @ p
-        p = np.stack([m @ walk_matrix(G, s) for m, s in zip(mixed, sigma[t])])
-        p /= p.sum()
-        best = log_likelihood[t].max()
-        p = p * np.exp(log_likelihood[t] - best)
-        log_sums[t] = best + np.log(p.sum())
-        density[t] = p = p / p.sum()
-    return Filtered(density, log_sums)
+    """Walks of noise sigma (M,), at least the width of a cell. cells (G,), even; start: mean and
+    standard deviation of the state; log_likelihood (T, G) of the cells at each bin."""
+    law = np.exp(-0.5 * np.square((cells - start[0]) / start[1]))
+    lag = np.arange(-len(cells) + 1, len(cells)) * (cells[1] - cells[0])
+    walks = np.exp(-0.5 * np.square(lag / sigma[:, None]))
+    walks /= walks.sum(axis=1, keepdims=True)
+    p, rows = initial[:, None] * law / law.sum(), []
+    for logs in log_likelihood:
+        p = np.array([np.convolve(q, walk, 'valid') for q, walk in zip(transition.T @ p, walks)])
+        p = p * np.exp(logs - logs.max())
+        evidence, p = logs.max() + np.log(p.sum()), p / p.sum()
+        mean = p.sum(axis=0) @ cells
+        rows.append((mean, p.sum(axis=0) @ np.square(cells - mean), p.sum(axis=1), evidence))
+    return Filtered(*(np.array(column) for column in zip(*rows)))

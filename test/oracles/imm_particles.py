@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from oracles.bin_likelihood import exponentials
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.trackers.bathymetry.filter_kernels import LEAST_CHANCE
-from sonar_imm.trackers.bathymetry.grid_kernels import exponentials
 
 
 class WeightUpdate(NamedTuple):
@@ -81,10 +81,7 @@ def weigh(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = None
     best = float(np.max(log_likelihood, initial=-math.inf, where=~np.isnan(log_likelihood)))
     if not math.isfinite(best):
         return WeightUpdate(prior, c, -math.inf, False)
-    q = np.empty((M, N))
-    for j in range(M):
-        exponentials(log_likelihood[j] - best, np.empty(N), q[j])
-    weight = prior * q
+    weight = prior * exponentials(log_likelihood - best)
     L = np.array([_total(row) for row in weight])
     joint = c * L
     total = _total(joint)

@@ -65,6 +65,8 @@ def converted(folder, text, kind, *options):
         ('Latitude_deg;lon [deg]', 'latitude longitude'),
         ('GPS Lat;GPS Long', 'latitude longitude'),
         ('lat_dd;lon_dd', 'latitude longitude'),
+        ('Zeitstempel;Empfänger;Sender-ID', 'stamp receiver tag'),
+        ('Fecha y hora;Receptor;Transmisor', 'stamp receiver tag'),
     ],
 )
 def test_headers_in_six_languages(table, headers, found):
@@ -340,6 +342,35 @@ def test_metres_and_degrees_that_disagree_are_a_question(tmp_path):
             how = CsvOptions(ignore=[name])
             notes = KINDS['fixes'](source, tmp_path / f'without_{name}', options=how).notes
             assert column in notes['columns of in.csv']
+
+
+@pytest.mark.parametrize(
+    'header, start, step, words, answer',
+    [
+        ('x,y', (-10.25, 54.5), 1e-5, 'as degrees do.*--column longitude=x', 'latitude=y'),
+        ('x,y', (-10.25, 54.5), 1e-5, 'or for metres --column x=x --column y=y', 'y=y'),
+        ('lat,lon', (0.951204, -0.178896), 1.6e-7, 'degrees or radians', 'latitude_rad'),
+        ('x,y', (-10.25, 54.5), 0.3, '', ''),
+        ('x [m],y [m]', (-10.25, 54.5), 1e-5, '', ''),
+        ('lat_rad,lon_rad', (0.951204, -0.178896), 1.6e-7, '', ''),
+        ('lat,lon', (0.951204, -3.178896), 1e-5, '', ''),
+    ],
+)
+def test_degrees_that_are_called_otherwise_are_a_question(
+    tmp_path, header, start, step, words, answer
+):
+    source = tmp_path / 'in.csv'
+    rows = ''.join(f'{k},{start[0]:.9f},{start[1] + step * k:.9f}\n' for k in range(9))
+    source.write_text(f'time,{header}\n{rows}')
+    if words:
+        with pytest.raises(BagError, match=words) as caught:
+            KINDS['fixes'](source, tmp_path / 'out')
+        assert answer in str(caught.value)
+        if answer == 'y=y':
+            how = CsvOptions(columns={'x': 'x', 'y': 'y'})
+            KINDS['fixes'](source, tmp_path / 'out', options=how)
+        return
+    assert KINDS['fixes'](source, tmp_path / 'out').messages == {'/fix': 9}
 
 
 @pytest.mark.parametrize('places', ['lat;lon', 'Breite;Länge', 'x;y'])

@@ -96,6 +96,8 @@ def test_times_of_day_in_one_number_pass_minutes_and_hours(stamps):
         ('time,x', ['45000.50000,1', '45000.50001,1', '45000.50002,1'],
          'may count days .excel. or seconds',
          {'excel': '2023-03-15 12:00:00', 's': '1970-01-01 12:30:00.5'}),
+        ('gps_time,x', ['1432980012.25,1', '1432980013.25,1'], 'GPS time, since 1980',
+         {'gps': '2025-06-03 09:59:54.25', 's': '2015-05-30 10:00:12.25'}),
     ],
 )  # fmt: skip
 def test_two_readings_are_a_question_with_an_option_for_each(

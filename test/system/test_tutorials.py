@@ -111,7 +111,8 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path, command: Path) -
         'PYTHONPATH': os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')]),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
     }
-    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
+    for name in ('bags', 'examples'):
+        (tmp_path / name).symlink_to(ROOT / name)
     output = tmp_path / 'output.log'
     with reserved_domain_id() as domain, output.open('w', encoding='utf-8') as log:
         environment['ROS_DOMAIN_ID'] = str(domain)

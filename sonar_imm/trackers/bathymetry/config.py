@@ -33,9 +33,7 @@ DEFAULT_SIGMAS = {
 """Noise of each model a range bin: metres, but 1/m for the slope model `ncs`."""
 DEFAULT_STAY = 0.995
 DEFAULT_SIGMAS_DEG = (0.1, 0.1, 2.0)
-SCALAR_SETS = ('height_two_rw', 'angle_two_rw')
-MODEL_SETS = ('terrain', 'height_rw_ncs', *SCALAR_SETS)
-"""`SCALAR_SETS`: those of one state, which the grid engine can run."""
+MODEL_SETS = ('terrain', 'height_rw_ncs', 'height_two_rw', 'angle_two_rw')
 SPEED_STD, SPEED_STD_OF_NONE = 2.0, 15.0
 """m/s, of a sound speed that a snapshot states, and of one that nobody does."""
 BEND_STD = 0.5
@@ -152,17 +150,10 @@ class BathymetryConfig(MountingParameters):
 
     # -- computation -----------------------------------------------------------------------------
     engine: str = constant('auto', '',
-        'gaussian (for terrain alone), particles, or grid (exact, without Monte Carlo noise, for '
-        'sets of one state); auto: gaussian for terrain, else particles',
-        choices=('auto', 'gaussian', 'particles', 'grid'))
+        'gaussian (terrain, and height_two_rw without Monte Carlo noise) or particles; auto: '
+        'gaussian for terrain, else particles', choices=('auto', 'gaussian', 'particles'))
     particles_per_model: int = live(100, '',
         'number of particles of each model', range=(2, 100_000))
-    grid_step: float = constant(0.0, '',
-        'distance between grid points, m or rad; 0: the smallest noise, at most 0.01 m or 0.05 '
-        'deg', range=(0.0, 100.0))
-    grid_extent: float = constant(20.0, 'm',
-        'distance that a grid of heights reaches to both sides of the start, at least 2 '
-        'sonar_height_std; a grid of angles holds all that are possible', range=(0.1, 1000.0))
     smoothing: str = live('auto', '',
         'use of the whole ping for each bin: none, modes (model probabilities only) or states '
         '(terrain only); auto: states for terrain, else none',
@@ -229,14 +220,9 @@ class BathymetryConfig(MountingParameters):
                 self.model_count(),
                 self.model_set,
             )
-        if self.engine == 'gaussian' and not self.is_terrain:
-            problems.append('engine gaussian is for model_set terrain only')
-        if self.runs_on_grid and self.model_set not in (*SCALAR_SETS, 'terrain'):
-            problems.append(
-                f'engine grid needs a set of one state ({", ".join(SCALAR_SETS)}), '
-                f'{self.model_set} has two'
-            )
-        if self.smoothing == 'states' and not (self.runs_on_grid or self.is_terrain):
+        if self.engine == 'gaussian' and self.model_set not in ('terrain', 'height_two_rw'):
+            problems.append('engine gaussian is for terrain and height_two_rw only')
+        if self.smoothing == 'states' and not self.is_terrain:
             problems.append(
                 'smoothing of the states needs model_set terrain; other sets smooth modes'
             )
@@ -358,14 +344,14 @@ class BathymetryConfig(MountingParameters):
         )
 
     @property
-    def runs_on_grid(self) -> bool:
-        """Whether the engine is the grid."""
-        return self.engine == 'grid'
+    def is_terrain(self) -> bool:
+        """Whether the models are those of `terrain`."""
+        return self.model_set == 'terrain'
 
     @property
-    def is_terrain(self) -> bool:
-        """Whether the models are those of `terrain`, and the engine the Gaussian one."""
-        return self.model_set == 'terrain'
+    def is_gaussian(self) -> bool:
+        """Whether the engine is the Gaussian one."""
+        return self.is_terrain or self.engine == 'gaussian'
 
     @property
     def smoothing_used(self) -> str:

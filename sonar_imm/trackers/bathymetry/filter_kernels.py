@@ -141,8 +141,8 @@ def filter_block(
     an echo; favour (T, M): see `models.TerrainModels`, (0, M) for none. Drawn: uniform (B, 2, M),
     standard normal noise (B, M, k, N).
 
-    The likelihood, see `grid_kernels.PingLikelihood`: echo (T,), form (T, P), base (T,), spread
-    (T, P) or None in white noise, signal (T,), table. The geometry, see `grid_kernels.Geometry`:
+    The likelihood, see `bins.PingLikelihood`: echo (T,), form (T, P), base (T,), spread
+    (T, P) or None in white noise, signal (T,), table. The geometry, see `bins.Geometry`:
     launch is None where rays are straight, tilt None for states that are heights.
 
     Scratch: c (M,), running and value (M, N), mixed (M, n, N), origin (N + 1,), work (5, N) and

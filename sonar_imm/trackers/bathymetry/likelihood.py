@@ -43,8 +43,8 @@ from ...acoustics.geometry import Pose
 from ...acoustics.sounding import ErrorBudget, GeometryDoubt, Looks
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...measurements import Snapshot
+from .bins import Geometry, PingLikelihood
 from .config import BathymetryConfig
-from .grid_kernels import Geometry, PingLikelihood
 
 _TABLE_DEPTH = 0.02
 """Metres to which the depth of the array is rounded for a table of rays, so that pings share
@@ -296,8 +296,8 @@ def spacing_of(
 
 class BinLikelihood(NamedTuple):
     """The likelihood of a ping; which bins (T,) stand 20 dB above the noise, or, where that is not
-    known, above the quietest tenth of the bins; and, for `terrain`, the direction sine (T,) from
-    which each is loudest, NaN for silent ones."""
+    known, above the quietest tenth of the bins; and, for the Gaussian engine, the direction sine
+    (T,) from which each is loudest, NaN for silent ones."""
 
     likelihood: PingLikelihood
     loud: BoolArray
@@ -402,7 +402,7 @@ def _in_white_noise(
     above_noise = power / noise
     signal, noise = _split(_signal(snapshot, power, noise, np.ones(T)), noise, config)
     gamma, sine = np.ones(T), np.full(T, np.nan)
-    if config.is_gated or config.is_terrain:
+    if config.is_gated or config.is_gaussian:
         gamma, sine = coherence.coherence(iq, abs(spacing), weights=weights)
     return _Parts(
         form=laplace.form_coefficients(iq, signal, noise, weights),
@@ -438,7 +438,7 @@ def _beside_surface(
     step = 2.0 * math.pi * spacing
     R = interference.noise_covariance(sines, level * signal[:, None], noise, P, step)
     form = interference.interference_form(iq, R)
-    sine = coherence.coherence(iq, abs(spacing))[1] if config.is_terrain else np.full(T, np.nan)
+    sine = coherence.coherence(iq, abs(spacing))[1] if config.is_gaussian else np.full(T, np.nan)
     return _Parts(
         form=-signal[:, None] * form.beam,
         base=form.base,

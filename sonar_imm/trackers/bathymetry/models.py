@@ -39,16 +39,13 @@ from scipy.special import ndtr, ndtri
 from ...acoustics.array import angle_of_depth
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.markov import check_transition_matrix, persistent
+from .bins import Geometry
 from .config import BathymetryConfig, DEFAULT_SIGMAS_DEG
-from .grid_kernels import Geometry
-from .terrain import EITHER, Terrain, terrain_of
+from .terrain import EITHER, Terrain, terrain_of, walks_of
 
 HEIGHT_STD, ANGLE_STD = 1.0, math.radians(5.0)
-HEIGHT_STEP, ANGLE_STEP = 0.01, math.radians(0.05)
 FIRST_RETURN_ERROR = 0.25
 """Metres by which the first return may be found too early."""
-MOST_CELLS = 20_000
-"""The grid has at most so many cells to either side of its middle."""
 
 
 @frozen(eq=False)
@@ -57,7 +54,7 @@ class UnknownHeight:
 
     The height of the floor is normal, mean and std, but not lower than `lowest`: there the first
     return would have come later. Angles are those at which such a floor is seen at the first bin,
-    from `height` of the array with `reach` and `tilt`, see `grid_kernels.Geometry`; None for
+    from `height` of the array with `reach` and `tilt`, see `bins.Geometry`; None for
     heights.
     """
 
@@ -76,16 +73,6 @@ class UnknownHeight:
         height, reach, tilt = self.view
         return np.arcsin(np.clip((height - z) / reach, -1.0, 1.0)) - tilt
 
-    def density(self, cells: FloatArray) -> FloatArray:
-        """Density (G,) at states `cells`, in any unit."""
-        z, slope = cells, np.ones(len(cells))
-        if self.view is not None:
-            height, reach, tilt = self.view
-            z, slope = height - reach * np.sin(cells + tilt), np.abs(np.cos(cells + tilt))
-            slope = np.where(np.abs(cells + tilt) <= 0.5 * math.pi, slope, 0.0)
-        shape = slope * np.exp(-0.5 * np.square((z - self.mean) / self.std))
-        return np.where(z >= self.lowest, shape, 0.0)
-
 
 @frozen(eq=False)
 class TerrainModels:
@@ -95,9 +82,9 @@ class TerrainModels:
     initial (M,) probabilities before the first bin; mean (n,) and std (n,) of the state then;
     coast: the model that crosses bins without an echo. rough (M,): models that mean rough
     floor. start: the law of the first state where it is no normal one. favour (T, M): factors on
-    the predicted probability of each model in each bin, from elsewhere; (0, M) for none.
-
-    With `terrain` motions are there: F, G and scale say nothing.
+    the predicted probability of each model in each bin, from elsewhere; (0, M) for none. terrain:
+    the motions as the Gaussian engine takes them, None for particles; with those of the model set
+    `terrain` F, G and scale say nothing.
     """
 
     names: tuple[str, ...]
@@ -146,12 +133,6 @@ class TerrainModels:
                 x[j, a] = self.mean[a] + self.std[a] * ndtri(np.clip(level, 1e-12, 1.0 - 1e-12))
         return x
 
-    def density(self, cells: FloatArray) -> FloatArray:
-        """Density (G,) of the first state before the first bin at `cells`, in any unit."""
-        if self.start is not None:
-            return self.start.density(cells)
-        return np.exp(-0.5 * np.square((cells - self.mean[0]) / self.std[0]))
-
 
 def build_models(
     config: BathymetryConfig,
@@ -191,19 +172,26 @@ def build_models(
     else:
         F, G = np.ones((M, 1, 1)), np.ones((M, 1, 1))
         scale = _noises(config, ranges)
+    names = ('rw', 'ncs') if slope_set else ('rw_smooth', 'rw_rough')
+    transition = _transition(config, M)
+    initial = np.array(config.initial_probabilities or [1.0 / M] * M)
+    walks = None
+    if config.is_gaussian:
+        walks = walks_of(names, scale[0], transition, initial, _bin_width(ranges))
     return TerrainModels(
-        names=('rw', 'ncs') if slope_set else ('rw_smooth', 'rw_rough'),
+        names=names,
         state_names=_states(config),
         F=F,
         G=G,
         scale=np.array(np.broadcast_to(scale, (T, M)), order='C'),
-        transition=_transition(config, M),
-        initial=np.array(config.initial_probabilities or [1.0 / M] * M),
+        transition=transition,
+        initial=initial,
         mean=np.array([mean, 0.0][: F.shape[1]]),
         std=np.array([std, config.initial_slope_std][: F.shape[1]]),
         coast=1 if slope_set else int(np.argmin(scale.sum(axis=0))),
         rough=np.arange(M) == (0 if slope_set else 1),
         start=start,
+        terrain=walks,
     )
 
 
@@ -283,17 +271,3 @@ def _unknown_height(
         lowest=height - float(ranges[first]) - FIRST_RETURN_ERROR,
         view=None if geometry.of_heights else view,
     )
-
-
-def grid_cells(config: BathymetryConfig, models: TerrainModels) -> FloatArray:
-    """Cells (G,) for the grid engine: even, one of them at the mean of the start."""
-    angle = config.model_set == 'angle_two_rw'
-    step = config.grid_step
-    if not step > 0.0:
-        noises = models.scale[models.scale > 0.0]
-        finest = ANGLE_STEP if angle else HEIGHT_STEP
-        step = min(noises.min(initial=np.inf), finest)
-    extent = math.pi if angle else max(config.grid_extent, 2.0 * config.sonar_height_std)
-    count = math.ceil(min(extent / step, MOST_CELLS))
-    cells = models.mean[0] + extent * np.arange(-count, count + 1) / count
-    return cells[np.abs(cells) <= 0.5 * math.pi] if angle else cells

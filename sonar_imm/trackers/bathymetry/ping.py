@@ -9,10 +9,9 @@
 """One ping, from the snapshot to the estimate: no ping needs another one, so these are functions.
 
 `look` says which bins hold an echo and which models there are, `run` runs the models along the
-ping, by Gaussian filters, by particles or on a grid, and `summarise` makes the answer, a table and
-what to count. The same numbers come out wherever and whenever a ping is computed; a recording's
-pings can be shared out over processes. All take the same likelihood. Particles and grid take the
-same models too, and give the same answer up to the Monte Carlo noise of the particles.
+ping, by Gaussian filters or by particles, and `summarise` makes the answer, a table and what to
+count. The same numbers come out wherever and whenever a ping is computed; a recording's pings can
+be shared out over processes.
 """
 
 from __future__ import annotations
@@ -38,17 +37,10 @@ from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.smoothing import smooth_modes
 from ...measurements import Snapshot
 from ...soundings import SIDES
+from .bins import Particles, PingLikelihood, Track
 from .config import BathymetryConfig
 from .filter_kernels import filter_block, normals
 from .findings import LoudBins, residual_ratio
-from .grid_kernels import (
-    filter_ping,
-    GridMotion,
-    Particles,
-    PingLikelihood,
-    smooth_ping,
-    Track,
-)
 from .likelihood import (
     Floor,
     level_swath,
@@ -59,8 +51,8 @@ from .likelihood import (
     stated_noise,
     Swath,
 )
-from .models import build_models, grid_cells, TerrainModels
-from .terrain_filter import run_terrain
+from .models import build_models, TerrainModels
+from .terrain_filter import bridged, run_terrain
 from .two_surfaces import EXISTS, FEWEST_STAVES, resolve, Surfaces
 
 SMOOTH, ROUGH, CANNOT_TELL = 0, 1, 2
@@ -194,13 +186,13 @@ def run(seen: Look, favour: FloatArray | None = None) -> Track:
     if favour is not None:
         models = evolve(models, favour=favour)
     smooth = config.smoothing_used == 'states'
-    if config.is_terrain:
+    if config.is_gaussian:
         peak = seen.swath.height_from(seen.loudest)
-        track = run_terrain(models, likelihood, peak, smooth=smooth, temper=1.0 / seen.alike)
+        told, temper = likelihood, 1.0
+        if config.is_terrain:
+            told, temper = bridged(likelihood), 1.0 / seen.alike
+        track = run_terrain(models, told, peak, smooth=smooth, temper=temper)
         track = _with_constants(track, likelihood)
-    elif config.runs_on_grid:
-        cells = grid_cells(config, models)
-        track = run_grid(models, likelihood, cells, smooth=smooth)
     else:
         entropy = config.seed, seen.ping.snapshot.stamp_ns, int(seen.swath.side == 'port')
         track = run_particles(models, likelihood, config.particles_per_model, entropy)
@@ -291,34 +283,15 @@ def filter_bins(
     filter_block(first, *chain.from_iterable(groups))
 
 
-def run_grid(
-    models: TerrainModels, ping: PingLikelihood, cells: FloatArray, *, smooth: bool
-) -> Track:
-    """The exact filter along a ping for models of one state, on `cells` (G,), evenly spaced; with
-    `smooth` the exact smoother."""
-    T = len(models.scale)
-    track = _empty(T, len(models.names), 1)
-    track.sample_size[:] = np.nan
-    shape = models.density(cells)
-    p = models.initial[:, None] * (shape / shape.sum())
-    step = cells[1] - cells[0]
-    scale, favour = models.scale / step, models.favour
-    motion = GridMotion(cells, models.transition, scale, models.coast, favour)
-    window = np.empty((T, 2), np.int64)
-    kept = filter_ping(p, motion, ping, window, track, smooth)
-    if smooth:
-        smooth_ping(kept, window, motion, ping, track)
-    return _with_constants(track, ping)
-
-
 def _empty(T: int, M: int, n: int) -> Track:
     return Track(np.empty((T, n)), np.empty((T, n, n)), np.empty((T, M)), np.empty(T), np.empty(T))
 
 
 def _with_constants(track: Track, ping: PingLikelihood) -> Track:
-    """The same with log likelihoods of the samples, not only of what depends on the state."""
-    constant = np.where(ping.echo, ping.constant, 0.0)
-    return track._replace(log_likelihood=track.log_likelihood + constant)
+    """The same with log likelihoods of the samples, not only of what depends on the state; zero
+    in bins without an echo."""
+    whole = np.where(ping.echo, track.log_likelihood + ping.constant, 0.0)
+    return track._replace(log_likelihood=whole)
 
 
 def summarise(seen: Look, track: Track) -> Answer:

@@ -40,6 +40,7 @@ FEWER_FLOWS = 0.1
 """Of those between level and steady floor."""
 _ROUNDS = 2000
 """At most, for the fixed point of the flows, which takes about 100 to 250."""
+LEAST_CHANGE = 1e-12
 MOST_LEFT = 0.5
 """A model is left over a bin with at most this probability, however wide the bin."""
 
@@ -90,6 +91,31 @@ class Terrain(NamedTuple):
     transition: FloatArray
     stationary: FloatArray
     width: float
+
+
+def walks_of(
+    names: tuple[str, ...],
+    walk: FloatArray,
+    transition: FloatArray,
+    initial: FloatArray,
+    width: float,
+) -> Terrain:
+    """Return smooth and rough random walks, noises walk (2,) m a bin, for the outward filter:
+    `initial` (2,) is before the first bin, and the chain need not be reversible. No transition is
+    less probable than `LEAST_CHANGE`: what mixes has a source."""
+    nothing = np.zeros(2)
+    return Terrain(
+        names=names,
+        rough=np.array([False, True]),
+        walk=walk,
+        phi=nothing,
+        follow=np.zeros(2, bool),
+        scatter=nothing,
+        coast=np.full(2, np.argmin(walk)),
+        transition=np.maximum(transition, LEAST_CHANGE),
+        stationary=initial,
+        width=width,
+    )
 
 
 @lru_cache(maxsize=16)

@@ -16,15 +16,33 @@ from typing import Any
 import numpy as np
 
 from ...estimation.arrays import FloatArray
-from .grid_kernels import PingLikelihood, Track
+from .bins import PingLikelihood, Track
 from .models import TerrainModels
 from .terrain import SLOPE0
 from .terrain_kernels import filter_terrain, NODES, ROWS
 
 UNAMBIGUOUS = 0.6
 """Spacing in wavelengths up to which no floor but at the end of the circle has a second lobe."""
+GAP = 3.0
+"""m, of the widest gap in which the chain of the models goes on; in a wider one, a shadow, a slope
+would be forgotten."""
 PARTS, PART_STD = np.linspace(-3.0, 3.0, 9), 0.4
 """Of the start, in its standard deviations: where its parts are, and how wide."""
+
+
+def bridged(ping: PingLikelihood) -> PingLikelihood:
+    """Return the same with bins that say nothing in the gaps between echoes, up to `GAP` wide.
+
+    How far a kind of floor goes on is counted in metres. Far off, half of the echoes are too weak
+    to be used: where the chain rests there, kinds go on twice as far."""
+    held, heard = np.flatnonzero(ping.echo), ping.echo[:, None]
+    if not len(held):
+        return ping
+    echo = ping.echo.copy()
+    near = np.diff(ping.ranges[held]) <= GAP
+    echo[held[0] : held[-1]] |= np.repeat(near, np.diff(held))
+    form, spread = np.where(heard, ping.form, 0.0), np.where(heard, ping.spread, 0.0)
+    return ping._replace(echo=echo, form=form, spread=spread)
 
 
 def run_terrain(

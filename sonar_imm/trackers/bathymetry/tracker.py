@@ -25,10 +25,8 @@ The cycle of the particle filter, for each bin with an echo (`filter_kernels`):
     summarise   height or angle, its covariance, and the probability of each model
 
 There is no rejuvenation step, `move`: the noise of every terrain model keeps copies of a particle
-apart. Through bins without an echo particles are only propagated. A model set of one state can run
-on a grid, whose verbs are the same, but for resampling, which cells do not need. The default set,
-`terrain`, needs neither: two Gaussian filters run along the ping, outward and inward
-(`terrain_kernels`).
+apart. Through bins without an echo particles are only propagated. The default set, `terrain`, has
+none: two Gaussian filters run along the ping, outward and inward (`terrain_kernels`).
 
 Nothing is carried from one ping to the next, which loses more than it gains (docs/bathymetry.md).
 Late, shuffled or repeated pings therefore need no care; the random numbers of a ping come from its
@@ -61,6 +59,7 @@ from ...intake import KnownFrames
 from ...intake.stream import Stream, StreamRules
 from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
 from ..navigation import MOST_WAITING, NavigationBuffer
+from .bins import Track
 from .config import BathymetryConfig
 from .findings import (
     FEWEST_PINGS,
@@ -74,7 +73,6 @@ from .findings import (
     TILTS,
     with_open_start,
 )
-from .grid_kernels import Track
 from .ping import (
     Answer,
     bin_stamps,

@@ -41,7 +41,7 @@ from ...acoustics import rays
 from ...acoustics.layover import BIRTH, END, Layover
 from ...acoustics.variances import HALF_WIDTH, mean_power, moving_mean
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
-from .grid_kernels import Geometry, PingLikelihood
+from .bins import Geometry, PingLikelihood
 from .surface_kernels import pair_likelihoods, step_orders, weigh_orders
 
 POSSIBLE, MARGIN = 0.05, 10

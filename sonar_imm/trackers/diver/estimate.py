@@ -69,7 +69,8 @@ def estimate_of(
     if models.height >= 0 and models.rows_per_track > 1:
         extras['depth_ambiguous'] = depth.ambiguous_depths(known, models).astype(np.uint8)
     if origin is not None:
-        place = origin.geodetic(xyz)
+        flat = models.height < 0
+        place = origin.at_height(xyz[:, :2], config.target_z) if flat else origin.geodetic(xyz)
         extras |= {'latitude': place[:, 0], 'longitude': place[:, 1]}
     return Estimate(
         stamp_ns=known.stamp_ns,

@@ -234,9 +234,10 @@ class DiverTracker:
     def _revise(self, measurement: Measurement) -> list[tuple[int, Known]]:
         """Return the new or changed states with their stamps, oldest first."""
         revised: dict[int, Known] = {}
-        moves = self.counts['origin_moved']
+        before = self.origin
         placed = self._georeferencer.georeference(measurement)
-        if self.counts['origin_moved'] > moves:
+        if before not in (None, self.origin):
+            # All that was placed lies elsewhere.
             self._stream.forget()
         for ready in placed:
             revised.update(self._stream.revise(ready))

@@ -122,8 +122,6 @@ class FathometerConfig(StampParameters):
     noise_sigma: float = live(0.0, '',
         'standard deviation of the noise of a trace; 0: as the trace says, else measured',
         range=(0.0, 1e30))
-    remove_background: bool = constant(False, '',
-        'for envelopes: subtract the median of the noise from the trace first')
 
     # -- pulse ------------------------------------------------------------------------------------
     pulse: str = parameter('auto', '',
@@ -302,9 +300,7 @@ class FathometerConfig(StampParameters):
     @property
     def negative_share(self) -> float:
         """How many of the new reflectors are negative."""
-        if self.polarity != 'both' or self.remove_background:
-            return 0.0
-        return self.negative_probability
+        return self.negative_probability if self.polarity == 'both' else 0.0
 
     @property
     def amplitude_std(self) -> float:

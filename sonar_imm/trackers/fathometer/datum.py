@@ -63,14 +63,14 @@ _PRIOR = np.multiply.outer(
 class DatumError:
     """Changes of depth, m, that reflectors of two records have in common, and their noise, (n, 2).
     STATE: see `trackers.Tracker`. followed: standard deviation with which the error is a state, m;
-    _heave: that was taken off the last record, m; _jumps: in how many records all jumped far, and
+    heave: that was taken off the last record, m; _jumps: in how many records all jumped far, and
     _last, by how many m in the last of them."""
 
-    STATE: ClassVar = ('_changes', 'followed', '_heave', '_jumps', '_last')
+    STATE: ClassVar = ('_changes', 'followed', 'heave', '_jumps', '_last')
 
     _changes: Annotated[FloatArray, 'n2'] = field(init=False, factory=lambda: np.empty((0, 2)))
     followed: float = field(init=False, default=0.0)
-    _heave: float = field(init=False, default=0.0)
+    heave: float = field(init=False, default=0.0)
     _jumps: int = field(init=False, default=0)
     _last: float = field(init=False, default=0.0)
 
@@ -98,14 +98,14 @@ class DatumError:
         if len(moved) and array:
             # A reflector that is seen well counts as much as all that are not.
             change, precision = np.average(moved[:, 0], weights=moved[:, 1]), moved[:, 1].sum()
-            self.add(float(change) + found.heave - self._heave, float(1.0 / precision))
-        self._heave = found.heave
+            self.add(float(change) + found.heave - self.heave, float(1.0 / precision))
+        self.heave = found.heave
 
     def require(self) -> None:
         """Raise ValueError where the state, which may come from a file, is impossible."""
         good = np.isfinite(self._changes).all() and 0.0 <= self.followed <= MOST
         good = good and bool((self._changes[:, 1] >= 0.0).all())
-        numbers = self._last, self._heave
+        numbers = self._last, self.heave
         if not (good and self._jumps >= 0 and all(map(math.isfinite, numbers))):
             raise ValueError('no array is as deep as that')
 
@@ -120,6 +120,10 @@ class DatumError:
         if len(self._changes) < LEAST:
             return self.followed
         return math.sqrt(float(self.weights @ np.square(ERRORS)))
+
+    def counted(self, config: FathometerConfig) -> float:
+        """What counts in the covariance, m: nothing where no error is told."""
+        return self.found if config.array_depth_std else 0.0
 
     def exceeds(self, config: FathometerConfig) -> bool:
         """Whether the error is far greater than what is told, for sure."""

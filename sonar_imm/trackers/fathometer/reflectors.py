@@ -16,7 +16,7 @@ came, none was missed: how far a reflector may have walked grows with the time, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import math
 from typing import NamedTuple
 
@@ -353,6 +353,18 @@ class Taken:
     response: Response
     named: tuple[Identified, ...]
     jump: float
+
+
+def earlier_ids(depth: FloatArray, taken: Iterable[Taken], config: FathometerConfig) -> IdArray:
+    """Ids (K,) of reflectors at `depth` (K,) of the first of the records `taken`. One that only
+    smoothing finds so early has its id from a later record."""
+    ids = np.zeros(len(depth), np.uint32)
+    for k, each in enumerate(taken):
+        depth = depth + each.jump if k else depth
+        free = [named for named in each.named if named.track_id not in ids]
+        missing = np.flatnonzero(ids == 0)
+        ids[missing] = nearest_ids(depth[missing], free, config)
+    return ids
 
 
 def reflectors_of(

@@ -123,6 +123,14 @@ class Response:
         """Median of the noise over the depths, in the unit of the record."""
         return float(np.median(self.rms if len(self.rms) else self.sigma))
 
+    def onto(self, padded: Lattice) -> Response:
+        """The same at other depths of the same step and centre; nothing is known of new ones."""
+        more = (padded.cells - len(self.depth)) // 2
+        cells = slice(max(-more, 0), len(self.depth) - max(-more, 0))
+        sigma = np.pad(self.sigma[cells], max(more, 0), 'edge')
+        amplitude = np.pad(self.amplitude[cells], max(more, 0))
+        return evolve(self, depth=padded.depth, amplitude=amplitude, sigma=sigma)
+
 
 def pulse_of(config: FathometerConfig) -> Pulse:
     """The pulse that is configured, that of the band where each record has its own.
@@ -262,8 +270,6 @@ def trace_response(
     quiet &= np.isfinite(trace.amplitude)
     if np.count_nonzero(quiet) < LEAST_NOISE_SAMPLES:
         quiet = np.isfinite(trace.amplitude)
-    if config.remove_background:
-        amplitude = amplitude - np.median(amplitude[quiet])
     sigma, noise_unknown = stated_sigma(trace, depth, config.noise_sigma), False
     if sigma is None:
         sigma = np.full(len(depth), measured_sigma(amplitude[quiet]))

@@ -29,8 +29,7 @@ After a gap, or a longer way, what is per record happens as often as records wou
 (`Pace`).
 
 With a `smoothing_lag`, `process` gives the revised estimate of an earlier record before that of
-the newest. A preview is the newest, too, but leaves the filter as it was: windows that overlap are
-not independent, and taking them for that invents reflectors.
+the newest. A preview leaves the filter as it was: windows that overlap are not independent.
 
 Source: docs/fathometer.md, after C. Yardim, P. Gerstoft, Z.-H. Michalopoulou, *Passive fathometer
 reflector identification with multiple model particle filtering*.
@@ -39,7 +38,7 @@ reflector identification with multiple model particle filtering*.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 import math
 from typing import Any
 
@@ -62,7 +61,7 @@ from ...intake import KnownFrames
 from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection, Trace
 from .config import FathometerConfig
-from .datum import DatumError
+from .datum import DatumError, LEAST_FOLLOWED
 from .fit import Fit, has_negative_residual
 from .multiples import Multiples, seen_as
 from .phones import PhoneFaults
@@ -75,9 +74,9 @@ from .pressure import (
     PressureStream,
 )
 from .reflectors import (
+    earlier_ids,
     IdArray,
     Identities,
-    nearest_ids,
     Reflectors,
     reflectors_of,
     Taken,
@@ -120,7 +119,7 @@ class FathometerTracker:
     STATE = (
         *('response', 'refusals', '_stream', '_pace', '_ids', '_depths', '_places'),
         *('_hydrophones', '_pressure', '_multiples', '_lattice', '_before', '_smoother'),
-        *('_taken', '_health', '_fit', '_phones', '_water', '_datum', '_width'),
+        *('_taken', '_recent', '_health', '_fit', '_phones', '_water', '_datum', '_width'),
     )
 
     response: Response | None
@@ -137,6 +136,7 @@ class FathometerTracker:
     _before: Weighted | None
     _smoother: LagSmoother
     _taken: deque[Taken]
+    _recent: deque[Response]
     _health: dict[str, float]
     _fit: Fit
     _phones: PhoneFaults
@@ -184,6 +184,7 @@ class FathometerTracker:
         self._before = None
         self._smoother = LagSmoother(self._own.smoothing_lag)
         self._taken = deque(maxlen=self._own.smoothing_lag + 1)
+        self._recent = deque(maxlen=LEAST_FOLLOWED)
         self._health = {}
         self._fit = Fit()
         self._phones = PhoneFaults()
@@ -267,8 +268,7 @@ class FathometerTracker:
                 'echoes are weaker than they should be'
             )
         found += self._phones.warnings() + self._water.warnings()
-        found += self._datum.warnings(self.config)
-        return [*found, *self._fit.warnings(self._own)]
+        return [*found, *self._datum.warnings(self.config), *self._fit.warnings(self._own)]
 
     def process(self, measurement: Any) -> list[Estimate]:
         if isinstance(measurement, ArrayDepth):
@@ -459,12 +459,6 @@ class FathometerTracker:
         tables = self._lattice.cells * (2.0 * reach + 1.0)
         return records == 1 or (records <= LONGEST_GAP and tables <= MAX_MOVES)
 
-    @property
-    def _error_of_depth(self) -> float:
-        """Of the array, as it was found, m; 0 where it is not looked for."""
-        told = self.config.array_depth_std
-        return self._datum.found if told and not self._water.active else 0.0
-
     def _named(self, reflectors: Reflectors, records: int) -> tuple[Identities, IdArray]:
         known = self._ids.wait(records - 1) if records <= LONGEST_GAP else self._ids.forget()
         # Where heave begins to be a state, all depths may come to lie elsewhere together.
@@ -496,6 +490,11 @@ class FathometerTracker:
         if records == 1:
             array = not self._water.active
             self._datum.note(before, ids, reflectors, self._own, array=array)
+        if again := self._datum_followed(response):
+            response, step = again
+            reflectors, pmf = self._summarise(step, response)
+            self._ids, ids = self._named(reflectors, 1)
+            self._datum.heave = reflectors.heave
         self._taken.append(Taken(response, self._ids.reflectors, reflectors.probable_jump))
         self._health.update(
             effective_sample_size=step.effective,
@@ -503,43 +502,51 @@ class FathometerTracker:
             sigma=response.noise,
             order=float(self._own.order_min + int(np.argmax(pmf))),
         )
-        positive = self._settled.polarity == 'positive'
-        negative = positive and has_negative_residual(
+        negative = self._settled.polarity == 'positive' and has_negative_residual(
             reflectors, response, response.pulse or self.pulse, self._own
         )
         self.counts['foreign_hydrophones_left_out'] += self._phones.add(response, self._own)
         self._fit.add(step.ok, reflectors, response, float(pmf[-1]), negative)
         newest = self._write(reflectors, ids, pmf, response, self._ids, records)
         self._multiples = self._multiples.after(seen_as(reflectors, ids, records))
-        estimates = [*self._smoothed(step), newest]
-        self._follow_datum()
-        return estimates
+        return [*self._smoothed(step), newest]
 
-    def _follow_datum(self) -> None:
-        """Make the error of the array's depth a state from the next record on, where it is far
-        greater than what is told, or than what is followed. The reflectors keep their ids."""
+    def _datum_followed(self, response: Response) -> tuple[Response, SetStep] | None:
+        """Make the error of the array's depth a state, where it is far greater than what is told,
+        or than what is followed, and take the last records again; the newest as it is seen then,
+        None where nothing changes. The reflectors keep their ids."""
         datum, lattice = self._datum, self._lattice
         # What moves the floor of a profiler is its ship, which slopes follow.
         if self.config.heave != 'auto' or self._water.active or lattice is None:
-            return
+            return None
+        self._recent.append(response)
         before = datum.followed
         if not datum.follow(self.config):
-            return
+            return None
         self._own = self._effective()
         try:
             lattice.require(self._own)
-            self._begin_anew(lattice)
+            self._begin_anew(lattice, self._recent)
         except (ValueError, Rejection):
             datum.followed = before
             self._own = self._effective()
             self._begin(lattice)
+            return None
+        assert self._padded is not None
+        # One record says where the layers lie as badly as the depth of the array is known.
+        for recent in self._recent:
+            response = recent.onto(self._padded)
+            step = self._cycle(response, 1)
+            self._before = step.after if step.ok else None
+        return response, step
 
-    def _begin_anew(self, lattice: Lattice) -> None:
+    def _begin_anew(self, lattice: Lattice, recent: Iterable[Response] = ()) -> None:
         """Go on with other depths or parameters. The reflectors keep their ids."""
         self._begin(lattice)
         self._before = None
         self._smoother = LagSmoother(self.config.smoothing_lag)
         self._taken.clear()
+        self._recent = deque(recent, maxlen=LEAST_FOLLOWED)
 
     def _preview(self, response: Response) -> Estimate:
         response, step, records, _ = self._filtered(response)
@@ -555,13 +562,7 @@ class FathometerTracker:
             return []
         response = self._taken[0].response
         reflectors, pmf = self._summarise(step, response)
-        # A reflector that only smoothing finds so early has its id from a later record.
-        ids, depth = np.zeros(len(reflectors.depth), np.uint32), reflectors.depth
-        for k, taken in enumerate(self._taken):
-            depth = depth + taken.jump if k else depth
-            free = [named for named in taken.named if named.track_id not in ids]
-            missing = np.flatnonzero(ids == 0)
-            ids[missing] = nearest_ids(depth[missing], free, self._own)
+        ids = earlier_ids(reflectors.depth, self._taken, self._own)
         return [self._write(reflectors, ids, pmf, response, self._ids)]
 
     def _write(
@@ -589,7 +590,7 @@ class FathometerTracker:
             known,
             response,
             self._own,
-            array_depth_found=self._error_of_depth,
+            array_depth_found=self._datum.counted(self.config),
             preview=preview,
         )
 
@@ -603,5 +604,5 @@ class FathometerTracker:
         members = find_members(sums, separation, most, self._own.existence_min, modes=modes)
         pulse, cell = response.pulse or self.pulse, self._lattice.step
         heave = (cell * shift[0], cell * shift[1]) if shift else None
-        common = heave, self._error_of_depth, jump
+        common = heave, self._datum.counted(self.config), jump
         return reflectors_of(members, response, self._lattice, pulse, self._own, *common), pmf

@@ -209,7 +209,7 @@ class Water:
 
     def begin(self, trace: Trace) -> None:
         """Lay out the depths by the first trace of a line, and see whether it is an envelope."""
-        wanted = self.config.water == 'auto' and not self.config.remove_background
+        wanted = self.config.water == 'auto'
         self.active = wanted and envelopes.is_envelope(trace.amplitude)
         below = np.flatnonzero(trace.depth >= self.config.blanking)
         if len(below) < LEAST_SAMPLES:

@@ -24,7 +24,7 @@ fixed     nothing
 swaying   moored, it swings about its place: e is the displacement, m, which forgets itself over
           `sway_time` and has the standard deviation `sway_std`; or `WIDER` times as much
 moving    e is the velocity, m/s, a random walk of `speed_noise`, or of less below `SLOW`;
-          horizontal only
+          horizontal only; what has just begun to move is apart for `BEGUN_TIME`
 others    of other packages, see `own_models`
 seabed    fixed, and as deep as the sea floor below the vehicle when it was seen first: a slice of
           its own
@@ -72,6 +72,10 @@ WIDER, WIDE_SHARE = 2.0, 0.1
 """How much farther some of what sways does so, and their share. Nobody knows beforehand how far a
 mooring lets go: one that swings twice as far as believed is outside of the 90 % band in a third of
 all cases. Echoes soon tell the two apart, so the share hardly matters."""
+BEGUN_TIME = 5.0
+"""s for which what begins to move has just begun, as a component of its own: else the little that
+begins in every step, of a velocity as unknown as that of a new obstacle, would keep what moves
+slowly from ever knowing its velocity."""
 SLOW = 0.3
 """Share of `max_speed` below which velocities change less, in proportion to the speed. Else what
 moves slowly and steadily would fit worse than a drift of the navigation, which hardly changes."""
@@ -363,25 +367,28 @@ class BehaviourSlices(DepthSlices):
         known = (*SWITCHING, *self.own, 'seabed')
         self.behaviours = tuple(name for name in known if name in config.behaviours)
         switching = [name for name in self.behaviours if name != 'seabed']
-        if 'swaying' in switching:
-            switching.insert(switching.index('swaying') + 1, 'swaying')
+        for name in ('swaying', 'moving'):
+            if name in switching:
+                switching.insert(switching.index(name) + 1, name)
         self.slices, self.M = config.components, len(switching)
         seabed = ['seabed'] * ('seabed' in self.behaviours)
         behaviour = np.array(switching * self.slices + seabed)
         self.K = len(behaviour)
         self._same = behaviour[: self.M, None] == behaviour[: self.M]
-        wide = np.zeros(self.K, np.bool_)
+        second = np.zeros(self.K, np.bool_)
         for a in np.flatnonzero(np.diagonal(self._same, offset=1)) + 1:
-            wide[a : self.slices * self.M : self.M] = True
+            second[a : self.slices * self.M : self.M] = True
         sways = behaviour == 'swaying'
-        self._sway = config.sway_std * np.where(wide, WIDER, 1.0) * sways
-        self._share = np.where(sways, np.where(wide, WIDE_SHARE, 1.0 - WIDE_SHARE), 1.0)
+        self._sway = config.sway_std * np.where(second, WIDER, 1.0) * sways
+        self._begun = second & (behaviour == 'moving')
+        self._share = np.where(sways, np.where(second, WIDE_SHARE, 1.0 - WIDE_SHARE), 1.0)
+        self._share[self._begun] = 0.0
         self._count, self._identity = round(self._share[: self.M].sum()), np.eye(self.M)
         self._is = {name: behaviour == name for name in known}
         self._of = np.stack([self._is[name] for name in self.behaviours], axis=-1).astype(float)
         self.moves = self._is['moving']
         self._swaying, self._moving = (self._is[name] * 1.0 for name in ('swaying', 'moving'))
-        self._slow = self._moving * (SLOW * config.max_speed) ** 2
+        self._slow = self._moving * ~self._begun * (SLOW * config.max_speed) ** 2
         self._prior = self._sway**2
         self._prior += self._moving * (0.5 * config.max_speed) ** 2
         for name, own in self.own.items():
@@ -433,7 +440,9 @@ class BehaviourSlices(DepthSlices):
         if not len(mixture.mu):
             return mixture
         chain = self._transition(dt)
-        return Mixture(*mixtures.mix(*mixture, self._prior, self.slices, chain, DROPPED))
+        return Mixture(
+            *mixtures.mix(*mixture, self._prior, self.slices, chain, self._same, DROPPED)
+        )
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
         parts = mu.reshape(len(mu), mu.shape[1] // self.K, self.K)
@@ -441,12 +450,18 @@ class BehaviourSlices(DepthSlices):
 
     def _transition(self, dt: float) -> FloatArray:
         """P[i, j], (M, M): probability that an obstacle of which i holds is one of j `dt` seconds
-        later. As long as it sways it does so equally far."""
-        share, N = self._share[: self.M], self._count
+        later. As long as it sways it does so equally far; what begins to move has just begun."""
+        share, N, begun = self._share[: self.M], self._count, self._begun[: self.M]
         rate = N / ((N - 1) * self.config.behaviour_time) if N > 1 else 0.0
         change = (1.0 - 1.0 / N) * -math.expm1(-rate * dt)
-        other = share * change / max(N - 1, 1)
-        return np.where(self._same, self._identity * (1.0 - change), other)
+        enters = np.where(self._is['moving'][: self.M], begun, share)
+        chain = np.where(
+            self._same, self._identity * (1.0 - change), enters * change / max(N - 1, 1)
+        )
+        settles = -math.expm1(-dt / BEGUN_TIME)
+        for a in np.flatnonzero(begun):
+            chain[a, a - 1], chain[a, a] = chain[a, a] * settles, chain[a, a] * (1.0 - settles)
+        return chain
 
     def _motion(self, dt: float) -> Motion:
         config, swaying, moving = self.config, self._swaying, self._moving

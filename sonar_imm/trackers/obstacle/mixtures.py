@@ -68,19 +68,16 @@ def mix(
     prior: FloatArray,
     slices: int,
     transition: FloatArray,
+    same: BoolArray,
     floor: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the components before a step in which an obstacle may change its behaviour.
 
     Component ``k M + a`` is behaviour a of slice k; components after the last slice are on their
     own. The M components of a slice interact by transition (M, M), ``[i, j]`` the probability of j
-    after i. States that all have are mixed. A displacement is no velocity: to e, a behaviour
-    brings its own, any other its prior, uncorrelated. Slices and components below the weight
-    `floor` are dropped.
-
-    Moments are those of what was of the behaviour before and of what came to it, each of share s
-    weighed by s^2. By s, the little that comes in every step, of an e as unknown as that of a new
-    obstacle, would keep a behaviour that is still improbable from ever knowing its e.
+    after i. States that all have are mixed. A displacement is no velocity: to e, what is of the
+    same behaviour, same (M, M), brings its own, any other its prior, uncorrelated. Slices and
+    components below the weight `floor` are dropped.
 
     :param prior: (C,) variance of e before anything is known, 0 for a behaviour without e.
     """
@@ -99,16 +96,14 @@ def mix(
     mu1[:, :inside] = np.where(mixed, total, 0.0).reshape(T, inside)
     share = W / np.where(total > 0.0, total, 1.0)[:, :, None]
     share = np.where((total > 0.0)[:, :, None], share, np.eye(M))
-    kept = share * np.eye(M)
-    came = share - kept
-    share = kept * kept.sum(axis=2, keepdims=True) + came * came.sum(axis=2, keepdims=True)
-    share = share / share.sum(axis=2, keepdims=True)
     x1, P1 = x.copy(), P.copy()
     xs, Ps = x[:, :inside].reshape(T, slices, M, n), P[:, :inside].reshape(T, slices, M, n, n)
     mean, spread = np.empty(xs.shape), np.empty(Ps.shape)
     variance = prior[:inside].reshape(slices, M)
     for a in range(M):
-        mean[:, :, a], spread[:, :, a] = _as_behaviour(xs, Ps, share[..., a], variance[:, a], a)
+        mean[:, :, a], spread[:, :, a] = _as_behaviour(
+            xs, Ps, share[..., a], variance[:, a], same[a]
+        )
     # A behaviour without e has none after the mixing either.
     extra = (variance == 0.0)[None, :, :, None] & (np.arange(n) >= COMMON)
     mean = np.where(mixed[..., None] & ~extra, mean, xs)
@@ -119,13 +114,14 @@ def mix(
 
 
 def _as_behaviour(
-    x: FloatArray, P: FloatArray, share: FloatArray, prior: FloatArray, own: int
+    x: FloatArray, P: FloatArray, share: FloatArray, prior: FloatArray, same: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (T, S, n) and covariance (T, S, n, n) of the mixture of the behaviours x (T, S,
-    M, n) of each slice with `share` (T, S, M), as the behaviour `own` sees them."""
+    M, n) of each slice with `share` (T, S, M), as a behaviour sees them to which some (M,) are the
+    same."""
     n = x.shape[-1]
     if n > COMMON:
-        others = np.arange(x.shape[2]) != own
+        others = ~same
         x, P = x.copy(), P.copy()
         x[:, :, others, COMMON:] = 0.0
         P[:, :, others, COMMON:] = P[:, :, others, :, COMMON:] = 0.0

@@ -75,8 +75,8 @@ def _of_pings(run: Mapping[str, Any], swath: Swath) -> Iterator[Section]:
     which = f' Ping {number + 1} of {len(swath.profiles)}.'
     yield Section(
         'Profile of the floor',
-        'Height along one ping. Dotted: truth. Shaded: two standard deviations, which should hold '
-        f'95 % of the truth. Blue: the true rough patch.{_of_two(profile)}{which}',
+        'Height along one ping. Shaded: two standard deviations, which should hold 95 % of the '
+        f'truth.{_of_truth(profile)}{_of_two(profile)}{which}',
         profile_figure(profile),
         picture=True,
     )
@@ -107,6 +107,10 @@ def _of_pings(run: Mapping[str, Any], swath: Swath) -> Iterator[Section]:
             f'probability lies between .1 and .9.{which}',
             verdict_figure(profile, swath.roughness(profile)),
         )
+
+
+def _of_truth(profile: Profile) -> str:
+    return '' if profile.truth is None else ' Dotted: truth. Blue: the true rough patch.'
 
 
 def _of_two(profile: Profile) -> str:

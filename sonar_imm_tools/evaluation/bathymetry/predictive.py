@@ -21,26 +21,23 @@ import numpy as np
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Snapshot
-from sonar_imm.trackers.bathymetry.config import (
-    BathymetryConfig,
-    DEFAULT_SIGMAS_DEG,
-    SCALAR_SETS,
-)
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig, DEFAULT_SIGMAS_DEG
 from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
 
 from ..tuning import Scores, Tunable
 
-MOST_PINGS = 16
+MOST_PINGS, PARTICLES = 16, 1000
 UNEXPLAINED = -200.0
 """Of a bin in which no model puts anything."""
 
 
 def for_tuning(config: BathymetryConfig) -> BathymetryConfig:
-    """On the grid, without Monte Carlo noise, where the models allow it; nothing looks back."""
-    engine = 'grid' if config.model_set in SCALAR_SETS else 'particles'
+    """Two walks of the height run as Gaussian filters, without Monte Carlo noise; what needs
+    particles has many. Nothing looks back."""
     return evolve(
         config,
-        engine='auto' if config.is_terrain else engine,
+        particles_per_model=max(config.particles_per_model, PARTICLES),
+        engine='gaussian' if config.model_set == 'height_two_rw' else 'auto',
         smoothing='none',
         ping_coupling=0.0,
         layover='ignored',

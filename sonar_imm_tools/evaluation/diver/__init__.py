@@ -185,9 +185,9 @@ SEEN, REMARK = seen, _remark
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
     """The result in a few sentences."""
     if _unscored(metrics):
-        return fill('{tracks_confirmed} confirmed tracks in {span_s:.0f} s. ', metrics) + (
-            UNMATCHED if 'scored_stamps' in metrics else NO_TRUTH
-        )
+        tracks = counted(metrics['tracks_confirmed'], 'confirmed track')
+        why = UNMATCHED if 'scored_stamps' in metrics else NO_TRUTH
+        return f'{tracks} in {metrics["span_s"]:.0f} s. {why}'
     sentences = ['On average the track lies {position.rmse_m:.2f} m from the truth (RMS).']
     judged = metrics['consistency']['verdict'] is not None
     if _truncated(metrics):

@@ -63,8 +63,8 @@ def sections(
     in_metres = map_figure(series, truth, fixes, names)
     yield Section(
         'Map',
-        'Seen from above. Dotted: truth. Crosses: raw fixes. Shaded: ellipses that should hold '
-        'the target 95 % of the time.',
+        f'Seen from above.{"" if truth is None else " Dotted: truth."} Crosses: raw fixes. '
+        'Shaded: ellipses that should hold the target 95 % of the time.',
         in_metres if origin is None else in_degrees(in_metres, origin),
         picture=True,
     )

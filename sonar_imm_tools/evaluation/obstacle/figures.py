@@ -57,7 +57,7 @@ def sections(
     yield Section(
         'Height over range',
         'How far each obstacle lies below the sonar, as it comes nearer from left to right. '
-        'Shaded: the 90 % band. Dotted: truth.',
+        f'Shaded: the 90 % band.{" Dotted: truth." if truth else ""}',
         offset_figure(series, _truths(found, truth), gap),
         picture=True,
     )
@@ -70,7 +70,8 @@ def sections(
     pings = [ping for ping in received if isinstance(ping, Detections) and len(ping)]
     yield Section(
         'Image of the sonar',
-        'Tracks among the detections of all pings. Dotted: truth, while the beam holds it.',
+        'Tracks among the detections of all pings.'
+        + (' Dotted: truth, while the beam holds it.' if truth else ''),
         image_figure(series, pings, truth),
     )
     if found is not None and len(found.row):

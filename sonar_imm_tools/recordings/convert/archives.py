@@ -42,12 +42,13 @@ from ..sources import BagError
 from ..tables import Row
 from ..truth import records_of
 from .navigation import ARRAYS, navigation_of_arrays, navigation_of_table
+from .sonar_files import Frame
 
 NAMES: dict[str, tuple[str, ...]] = {
     'iq': ('iq', 'snapshots', 'Y', 'quadrants'),
     'range': ('range', 'range_m', 'ranges', 'r'),
     'time': ('time', 'two_way_time'),
-    'stamp': ('stamp', 'stamps'),
+    'stamp': ('stamp', 'stamps', 'timestamp', 'timestamps', 'ping_time', 'unix_time', 'epoch'),
     'sound_speed': ('sound_speed', 'c'),
     'frequency': ('frequency', 'f0'),
     'element_spacing': ('element_spacing',),
@@ -62,14 +63,24 @@ NAMES: dict[str, tuple[str, ...]] = {
     'tilt': ('tilt',),
     **ARRAYS,
 }
-"""Usual names of each array; the first one that the archive has is taken. Stamps in seconds,
-spacings in metres or wavelengths, snr linear and at one stave, tilt in radians."""
+"""Usual names of each array; the first one that the archive has is taken, of more than a letter
+also in capitals. Stamps in s, ms, us, ns or datetime64, spacings in metres or wavelengths, snr
+linear and at one stave, tilt in radians."""
 
 TRACE_NAMES = {
     'depth', 'amplitude', 'sigma', 'reference_depth', 'reflector_depth', 'reflector_amplitude',
 }  # fmt: skip
 """The arrays of traces that are read, beside their stamps."""
 
+LONGEST_ECHO = 60.0
+"""Seconds that sound takes there and back, at most."""
+EPOCH_UNITS = {
+    1: (0.0, 2.0**31),
+    10**3: (1e11, 2.2e12),
+    10**6: (1e14, 2.2e15),
+    10**9: (1e17, 2e18),
+}
+"""Parts of a second in which times since 1970 are counted, by the size of those until 2038."""
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
 Arrays = dict[str, NDArray]
 _CONSTANTS = ('sound_speed', 'frequency', 'sample_rate')
@@ -80,12 +91,14 @@ def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionRepor
     """Convert an npz archive to the topic ``/snapshot``, one message per ping."""
     content = _Archive(path, how.names)
     samples = _samples(content, how.staves)
-    stamps = _stamps(content.path, content.get('stamp'), len(samples), how.ping_rate, 'pings')
+    times = content.get('stamp') if 'stamp' in how.names else content.times(len(samples))
+    stamps = _stamps(content.path, times, len(samples), how.ping_rate, 'pings', report)
     constants = {name: content.number(name) for name in _CONSTANTS}
     constants['element_spacing'] = _element_spacing(content, constants, report)
     poses = {name: array for name in ARRAYS if (array := content.get(name)) is not None}
-    records = navigation_of_table(how.nav, how.nav_options, report, on_earth=False)
-    records += [] if how.nav else navigation_of_arrays(poses, stamps, path, report)
+    frame = Frame()
+    records = navigation_of_table(how.nav, how.nav_options, report, on_earth=False, frame=frame)
+    records += [] if how.nav else navigation_of_arrays(poses, stamps, path, report, frame)
     for ping, (stamp, iq) in enumerate(zip(stamps, samples)):
         report.rows += 1
         try:
@@ -97,7 +110,15 @@ def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionRepor
         if (profile := _true_floor(content, ping, snapshot)) is not None:
             records += records_of(profile, '')
     report.note_ignored(path, content.unused)
-    write_bag(report.path, records, report, source=path.name, storage=how.storage)
+    write_bag(
+        report.path,
+        records,
+        report,
+        source=path.name,
+        storage=how.storage,
+        parameters={'bathymetry': frame.parameters()},
+        needed='/snapshot',
+    )
 
 
 class _Archive:
@@ -105,30 +126,45 @@ class _Archive:
 
     def __init__(self, path: str | Path, names: Mapping[str, str]):
         self.path = Path(path)
+        usual = {other: what for what, others in NAMES.items() for other in others}
+        names = {usual.get(name, name): array for name, array in names.items()}
         if unknown := [name for name in names if name not in NAMES]:
             raise BagError(f"unknown array '{unknown[0]}'; the names are {', '.join(NAMES)}")
         there = read_npz(self.path)
         wanted = {what: (names[what],) if what in names else NAMES[what] for what in NAMES}
         self._arrays: dict[str, NDArray] = {}
+        taken: set[str] = set()
         for what, candidates in wanted.items():
             found = [name for name in candidates if name in there]
+            found += [name for name in there if len(name) > 1 and name.lower() in candidates]
+            taken |= set(found)
             if found:
-                self._arrays[what] = numbers_of(self.path, found[0], there[found[0]])
+                array = there[found[0]]
+                dated = what == 'stamp' and array.dtype.kind == 'M'
+                self._arrays[what] = array if dated else numbers_of(self.path, found[0], array)
             elif what in names:
                 raise BagError(f"{path} has no array '{names[what]}'; it has {', '.join(there)}")
         self.listed = ', '.join(there)
-        taken = {name for candidates in wanted.values() for name in candidates}
         self.unused = [name for name in there if name not in taken]
 
     def get(self, what: str) -> NDArray | None:
         return self._arrays.get(what)
 
-    def need(self, what: str) -> NDArray:
-        if what not in self._arrays:
-            raise BagError(
-                f'{self.path} has no array {" or ".join(NAMES[what])}; it has {self.listed}'
-            )
-        return self._arrays[what]
+    def times(self, pings: int) -> NDArray | None:
+        """Give the stamps: also a time of each ping beside the range of each bin."""
+        time = self.get('time')
+        if 'stamp' in self._arrays or time is None or 'range' not in self._arrays:
+            return self.get('stamp')
+        of_pings = time.shape == (pings,) and np.nanmax(np.abs(time), initial=0.0) > LONGEST_ECHO
+        return time if of_pings or time.shape == (pings,) != self._arrays['range'].shape else None
+
+    def need(self, *what: str) -> NDArray:
+        """Give the first of these that is there. Raises `BagError`."""
+        for each in what:
+            if each in self._arrays:
+                return self._arrays[each]
+        usual = ' or '.join(name for each in what for name in NAMES[each])
+        raise BagError(f'{self.path} has no array {usual}; it has {self.listed}')
 
     def number(self, what: str) -> float | None:
         """Give a scalar; None when the archive has none."""
@@ -197,7 +233,7 @@ def _snapshot(
     bins = len(iq)
     ranges, time = content.per_bin('range', ping, bins), None
     if ranges is None:
-        content.need('time')
+        content.need('range', 'time')
         time = content.per_bin('time', ping, bins)
         assert time is not None
         ranges = np.asarray(0.5 * (constants['sound_speed'] or 1500.0) * time)
@@ -256,7 +292,7 @@ def convert_traces(path: Path, how: TracesOptions, report: ConversionReport) -> 
         records += _from_archive(report, path, how.rate, how.frame_id)
     else:
         records += _from_table(report, CsvTable(path, how.options), how.frame_id)
-    write_bag(report.path, records, report, source=path.name, storage=how.storage)
+    write_bag(report.path, records, report, source=path.name, storage=how.storage, needed='/trace')
 
 
 def _from_archive(
@@ -276,7 +312,7 @@ def _from_archive(
             f'{path}: depth has the shape {depth.shape} and amplitude {arrays["amplitude"].shape};'
             ' (n,) and (traces, n) are needed'
         )
-    stamps = _stamps(path, arrays.get('stamp'), T, rate, 'traces')
+    stamps = _stamps(path, arrays.get('stamp'), T, rate, 'traces', report)
     sigma = _rows(arrays, path, 'sigma', amplitude.shape)
     reference = _rows(arrays, path, 'reference_depth', (T,))
     records: list[Record] = []
@@ -392,14 +428,27 @@ def numbers_of(path: Path, name: str, array: NDArray) -> NDArray:
     return array
 
 
-def _stamps(path: Path, seconds: NDArray | None, count: int, rate: float, what: str) -> list[int]:
+def _stamps(
+    path: Path,
+    times: NDArray | None,
+    count: int,
+    rate: float,
+    what: str,
+    report: ConversionReport,
+) -> list[int]:
     """Nanoseconds of the stamps of `count` messages, `what` names them; `rate` per second without
     any. Raises `BagError` for those that a message cannot hold."""
-    if seconds is None:
+    if times is None:
+        flag = {'pings': '--ping-rate', 'traces': '--rate'}[what]
+        report.notes['stamps'] = f'the archive states none: {rate:g} {what} a second ({flag})'
         return [FIRST_STAMP_NS + round(k * 1e9 / rate) for k in range(count)]
-    values = numbers_of(path, 'stamp', seconds).ravel()
-    if len(values) != count or not (np.abs(values) < 2.0**31).all():
-        raise BagError(
-            f'{path}: {count} {what} need as many finite stamps, in seconds before 2038'
-        )
-    return [round(float(stamp) * 1e9) for stamp in values.real]
+    if times.dtype.kind == 'M':
+        times = times.astype('datetime64[ns]').astype(np.int64)
+    values = numbers_of(path, 'stamp', times).ravel()
+    size = np.abs(values.astype(np.float64))
+    for parts, (least, most) in EPOCH_UNITS.items():
+        if len(values) == count and (least <= size).all() and (size < most).all():
+            if values.dtype.kind in 'iu':
+                return [int(stamp) * (10**9 // parts) for stamp in values]
+            return [round(float(stamp) * (1e9 / parts)) for stamp in values.real]
+    raise BagError(f'{path}: {count} {what} need as many finite stamps, in seconds before 2038')

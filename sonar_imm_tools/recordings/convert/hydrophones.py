@@ -52,6 +52,9 @@ def convert_hydrophones(path: Path, how: HydrophonesOptions, report: ConversionR
     with _opened(path) as audio:
         channels = _channels(audio, how.channels)
         start_ns = _start_ns(path, how)
+        if not how.start:
+            utc = np.datetime64(start_ns, 'ns').astype('datetime64[s]')
+            report.notes['start'] = f'{utc}Z by the name of the file (--start, --time-zone)'
         rows = max(2, round(how.block * audio.samplerate))
         if rows * audio.channels > LONGEST_BLOCK:
             raise BagError(

@@ -27,7 +27,7 @@ from sonar_imm.measurements import Rejection
 from ..conversion import ConversionReport, flags_of
 from ..conversion import Record as Stamped
 from ..csv_table import CsvTable
-from ..places import Degrees
+from ..places import ask_for_angle, Degrees, TURN
 from ..positions import write_position
 from ..sources import BagError
 from ..tables import CsvOptions, Row
@@ -41,7 +41,8 @@ ARRAYS: dict[str, tuple[str, ...]] = {
     'y': ('y', 'north', 'northing'),
     'z': ('z',),
     'depth': ('sonar_depth',),
-    'heading': ('heading', 'hdg', 'heading_deg'),
+    'heading': ('heading', 'hdg'),
+    'heading_deg': ('heading_deg',),
     'heading_rad': ('heading_rad',),
     'yaw': ('yaw', 'yaw_rad'),
     'yaw_deg': ('yaw_deg',),
@@ -55,10 +56,15 @@ _SMALL = math.radians(90.0)
 
 
 def navigation_of_table(
-    path: Path | str | None, options: CsvOptions, report: ConversionReport, *, on_earth: bool
+    path: Path | str | None,
+    options: CsvOptions,
+    report: ConversionReport,
+    *,
+    on_earth: bool,
+    frame: Frame | None = None,
 ) -> list[Stamped]:
     """Return the messages of a table of positions: ``/position`` if `on_earth` and the table has
-    degrees, else ``/nav``. Raises `BagError`."""
+    degrees, else ``/nav``, in `frame`. Raises `BagError`."""
     if path is None:
         return []
     with flags_of('nav', report):
@@ -82,6 +88,7 @@ def navigation_of_table(
             return {**record, 'stamp_ns': stamp_ns, 'place': place, 'depth': -height}
 
         rows = [record for _, record in report.read_rows(table, parse)]
+        ask_for_angle(table, 'heading', (row['heading'] for row in rows))
     units = 'degrees' if geodetic else 'metres'
     report.rows -= len(rows)  # those of the input are counted
     if on_earth and geodetic:
@@ -90,14 +97,18 @@ def navigation_of_table(
             for row in rows
         ]
     records = ({**row, 'units': units, 'altitude': math.nan} for row in rows)
-    return list(_messages(records, Path(path), report))
+    return list(_messages(records, Path(path), report, frame or Frame()))
 
 
 def navigation_of_arrays(
-    arrays: Mapping[str, NDArray], stamps: list[int], path: Path, report: ConversionReport
+    arrays: Mapping[str, NDArray],
+    stamps: list[int],
+    path: Path,
+    report: ConversionReport,
+    frame: Frame,
 ) -> list[Stamped]:
-    """Return the ``/nav`` and ``/altitude`` messages of arrays by the names of `ARRAYS`, one value
-    per ping; none without a place. Raises `BagError`."""
+    """Return the ``/nav`` and ``/altitude`` messages in `frame` of arrays by the names of
+    `ARRAYS`, one value per ping; none without a place. Raises `BagError`."""
     count = len(stamps)
     values: dict[str, NDArray] = {}
     for name, array in arrays.items():
@@ -126,14 +137,13 @@ def navigation_of_arrays(
         }
         for k in range(count)
     )
-    return list(_messages(records, path, report))
+    return list(_messages(records, path, report, frame))
 
 
 def _messages(
-    records: Iterator[Record], path: Path, report: ConversionReport
+    records: Iterator[Record], path: Path, report: ConversionReport, frame: Frame
 ) -> Iterator[Stamped]:
     """Yield the messages of each record; what cannot be used is counted."""
-    frame = Frame()
     for k, record in enumerate(records):
         try:
             navigation = frame.navigation(record)
@@ -149,7 +159,14 @@ def _messages(
 
 def _heading(values: Mapping[str, NDArray], path: Path) -> NDArray:
     """Return the heading (n,), degrees clockwise from north. Raises `BagError`."""
+    if 'heading_deg' in values:
+        return values['heading_deg']
     if 'heading' in values:
+        if 0.0 < np.nanmax(np.abs(values['heading']), initial=0.0) <= TURN:
+            raise BagError(
+                f'{path}: heading may be in degrees or radians, none is beyond 2 pi; say --name '
+                'heading_deg=heading or --name heading_rad=heading'
+            )
         return values['heading']
     if 'heading_rad' in values:
         return np.degrees(values['heading_rad'])

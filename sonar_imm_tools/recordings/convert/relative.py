@@ -30,7 +30,14 @@ from ..conversion import ConversionReport, converter, Leaps, Record, write_bag
 from ..convert_options import RelativeOptions
 from ..csv_table import CsvTable
 from ..messages import ros_message
-from ..places import bearings_from, checked_origin, Degrees, origin_parameters, PolarRows
+from ..places import (
+    ask_for_angle,
+    bearings_from,
+    checked_origin,
+    Degrees,
+    origin_parameters,
+    PolarRows,
+)
 from ..sources import BagError
 from ..tables import Row
 from ..times import BadRow
@@ -68,7 +75,8 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     degrees = Degrees(table, 'vessel_') if geodetic else None
     polar = None
     if not table.has('forward', 'starboard'):
-        table.require('range', 'bearing')
+        across = table.has('forward') or table.has('starboard')
+        table.require(*(('forward', 'starboard') if across else ('range', 'bearing')))
         bearings = bearings_from(table, how.bearings, 'bow')
         polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg, how.ranges)
     levelled = polar is not None and bearings != 'bow'
@@ -86,8 +94,11 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
         )
     place = ('range', 'bearing') if polar else ('forward', 'starboard')
 
+    headings: list[float] = []
+
     def parse(row: Row) -> _Parsed:
         row.require_valid()
+        headings.append(row.optional('heading'))
         stamp_ns, name = row.stamp_ns(), row.text('id')
         pose = _pose(row, stamp_ns, degrees, levelled, how.frame_id)
         if row.empty(*place):
@@ -108,6 +119,8 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     rows = [parsed for _, parsed in report.read_rows(table, parse)]
     if polar:
         polar.check_unit()
+    if not levelled:
+        ask_for_angle(table, 'heading', headings)
     leaps = Leaps()
     if geodetic:
         leaps.saw_all(row.pose[0][2] for row in rows)
@@ -120,6 +133,8 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     if geodetic and rows and origin is None:
         first: VesselFix = rows[0].pose[0][2]
         origin = (first.latitude, first.longitude, 0.0)
+    if geodetic and origin is not None:
+        report.notes['origin'] = 'latitude {!r}, longitude {!r}, height {!r}'.format(*origin)
     records: list[Record] = []
     if any(row.fix is not None for row in rows):
         records = _poses(rows) + [_target(row, tags, how.frame_id) for row in rows]

@@ -14,6 +14,7 @@ it is an interferometer and becomes ``/snapshot``.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 import math
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ LOOKS = {'starboard': -90.0, 'port': 90.0}
 """Where side scan looks, degrees to port of ahead."""
 MOST_CLIPPED = 0.01
 """Of the samples, at full scale, before it is said."""
+LEAST_FULL_SCALE = 127
 ABEAM: dict[str, Any] = {'horizontal_fov_deg': 3.0, 'vertical_fov_deg': 80.0}
 """Parameters of the obstacle tracker for the narrow, high beam of a side scan."""
 
@@ -65,6 +67,9 @@ def convert_xtf(path: Path, how: XtfOptions, report: ConversionReport) -> None:
         sides = _sides(ping, how.port_samples)
         if not sides:
             raise Rejection('no_side_scan', 'it has no channel of side scan')
+        if how.side not in sides and not any(map(_is_phase, chain(*sides.values()))):
+            (other,) = sides
+            raise Rejection('other_side', f'it has channels of {other} alone: --side {other}')
         if (image := _image(ping, sides.get(how.side, []), how)) is not None:
             mount['max_range'] = max(mount.get('max_range', 1.0), float(image.range[-1]))
             found = detect(image, config)
@@ -102,6 +107,8 @@ class _Seen:
     echoes: int = 0
     samples: int = 0
     clipped: int = 0
+    top: int = 0
+    """The highest sample."""
     frequencies: set[float] = Factory(set)
 
     def ping(self, ping: Record) -> None:
@@ -118,7 +125,11 @@ class _Seen:
         samples = magnitudes[0]['samples']
         if samples.dtype.kind in 'iu':
             self.samples += len(samples)
-            self.clipped += int((samples == np.iinfo(samples.dtype).max).sum())
+            if (top := int(samples.max())) > self.top:
+                self.top, self.clipped = top, 0
+            # Of a converter of 8, 12 or 15 bits the highest value is all ones, too.
+            if self.top >= LEAST_FULL_SCALE and not self.top & (self.top + 1):
+                self.clipped += int((samples == self.top).sum())
 
     def tell(self, path: Path, report: ConversionReport) -> None:
         if self.images and not self.echoes:

@@ -38,6 +38,7 @@ from ..times import BadRow
 from ..writer import BagWriter
 
 LATEST = 2**31 * SECOND
+_SYSTEMS = {'detections': 'obstacle', 'snapshot': 'bathymetry'}
 Record = dict[str, Any]
 """What a reader says of a ping or a picture; see `xtf.pings_of`."""
 
@@ -51,11 +52,13 @@ class Message(NamedTuple):
 
 @define
 class Frame:
-    """Metres from the first position. missing: pings without a position."""
+    """Metres from the first position. missing: pings without a position; beyond: the first of
+    those with another one than is on Earth."""
 
     frame_id: str = 'map'
     origin: Origin | None = None
     missing: int = 0
+    beyond: str = ''
     last_ns: int = -1
     leaps: Leaps = Factory(Leaps)
 
@@ -67,6 +70,8 @@ class Frame:
         on_earth = abs(east) <= 180.0 and abs(north) <= 90.0 and (east or north)
         if not (known and record['units'] and (on_earth or not geodetic)):
             self.missing += 1
+            if known and geodetic and (east or north):
+                self.beyond = self.beyond or f'latitude {north:g}, longitude {east:g}'
             return None
         if geodetic:
             self.origin = self.origin or Origin(north, east)
@@ -83,12 +88,18 @@ class Frame:
             frame_id=self.frame_id,
         )
 
+    def parameters(self) -> dict[str, list[float]]:
+        """The origin as a parameter of nodes; nothing for places in metres."""
+        if (place := self.origin) is None:
+            return {}
+        return origin_parameters((place.latitude, place.longitude, 0.0))
+
     def tell(self, path: Path, report: ConversionReport) -> None:
         """Report the origin, and what is missing or looks wrong."""
         if self.missing:
             report.problems.append(
-                f'{path.name}: {self.missing} pings have no position (0, 0 is none); they have no '
-                'navigation'
+                f'{path.name}: {self.missing} pings have no position '
+                f'({self.beyond or "0, 0"} is none); they have no navigation'
             )
         self.leaps.tell(path, report)
         if place := self.origin:
@@ -145,9 +156,10 @@ def write_records(
             for message in made:
                 bag.write(message.topic, message.content, stamp_ns)
                 report.messages[message.topic] += 1
-        if '/detections' in report.messages and frame.origin is not None:
-            place = origin_parameters((frame.origin.latitude, frame.origin.longitude, 0.0))
-            own['obstacle'] = {**own.get('obstacle', {}), **place}
+        if place := frame.parameters():
+            for topic in report.messages:
+                if system := _SYSTEMS.get(topic.rpartition('/')[2]):
+                    own[system] = {**own.get(system, {}), **place}
         if not set(report.messages) - {'/nav', '/altitude'}:
             raise report.nothing(path)
     frame.tell(path, report)

@@ -14,6 +14,7 @@ that 32 bits reach 2000 km. What LAS has no field for becomes an extra dimension
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import csv
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.soundings import read_soundings
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import PLACES
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.measurements import Rejection
@@ -66,6 +68,43 @@ class Points:
         """The same with `origin` (3,), the map coordinates of the local frame, added to x y z."""
         places = {name: self[name] + shift for name, shift in zip('xyz', origin)}
         return Points(self.stamp_ns, {**self.columns, **places})
+
+    def placed(
+        self,
+        own: Origin | None,
+        epsg: int | None,
+        origin: tuple[float, float, float],
+        frame: Origin | None = None,
+    ) -> Points:
+        """The same in a coordinate system, or in metres from `frame` without one.
+
+        own: where the frame of the soundings lies on Earth; where that is not known, or map
+        coordinates of its `origin` (3,) are stated, these are added. z is a height everywhere, and
+        stays. Raises `BagError`. Needs rasterio with `epsg`.
+        """
+        if any(origin) or own is None:
+            return self.moved(origin)
+        if not epsg and frame in (None, own):
+            return self
+        longitude, latitude = own.degrees(np.column_stack([self['x'], self['y']]))
+        if epsg:
+            x, y = places_of(longitude, latitude, epsg)
+        else:
+            assert frame is not None
+            x, y = frame.local(latitude, longitude, frame.height)[:2]
+        return Points(self.stamp_ns, {**self.columns, 'x': x, 'y': y})
+
+
+def origin_of(record: Mapping[str, Any] | None, name: object) -> Origin | None:
+    """Return where the frame of a run lies on Earth; None where its run.json does not state it.
+    Raises `BagError` with the `name` of the run."""
+    if record is None or not record.get('origin'):
+        return None
+    try:
+        return Origin(**{key: float(value) for key, value in record['origin'].items()})
+    except (AttributeError, TypeError, ValueError, OverflowError):
+        sentence = f"'origin' in the run.json of {name} cannot be understood"
+        raise BagError(sentence) from None
 
 
 def read_points(path: Path) -> Points:
@@ -240,6 +279,17 @@ def wkt_of(epsg: int) -> str:
         return str(CRS.from_epsg(epsg).to_wkt())
     except CRSError:
         raise BagError(f'there is no coordinate system with the EPSG number {epsg}') from None
+
+
+def places_of(
+    longitude: FloatArray, latitude: FloatArray, epsg: int
+) -> tuple[FloatArray, FloatArray]:
+    """x and y (n,) in a coordinate system of degrees (n,). Raises `BagError`. Needs rasterio."""
+    wkt = wkt_of(epsg)
+    from rasterio.warp import transform
+
+    x, y = transform('EPSG:4326', wkt, longitude.tolist(), latitude.tolist())
+    return np.array(x), np.array(y)
 
 
 def degrees_of(places: FloatArray, epsg: int) -> tuple[FloatArray, FloatArray]:

@@ -33,7 +33,7 @@ from .horizons import feature, utc_text, write_features
 from .points import degrees_of
 
 Degrees = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Longitude and latitude (n,) of places (n, 2) in metres."""
+"""Longitude and latitude (n,) of places (n, 3) in metres, of which z may be NaN."""
 
 COLOURS = ('#e41a1c', '#377eb8', '#4daf4a', '#984ea3', '#ff7f00', '#a65628', '#f781bf', '#666666')
 _SPACE = 'urn:sonar_imm:track'
@@ -98,7 +98,7 @@ def tracks_of(
     order = np.lexsort((columns['stamp_ns'], columns['track_id']))
     columns = {name: column[order] for name, column in columns.items()}
     if degrees is not None:
-        places = np.column_stack([columns['x'], columns['y']])
+        places = np.column_stack([columns[axis] for axis in 'xyz'])
         columns['longitude'], columns['latitude'] = degrees(places)
     return Tracks(columns)
 

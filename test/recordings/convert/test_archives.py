@@ -17,9 +17,11 @@ import numpy as np
 import pytest
 
 from msg_adapters.estimates import read_estimate
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.geometry import rotation_of_quaternion
 from sonar_imm.measurements import Navigation
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.cli.track import Plan
 from sonar_imm_tools.recordings.convert import (
     convert_segy,
     convert_snapshots,
@@ -49,6 +51,9 @@ def convert(tmp_path):
         return report, received, truth
 
     return run
+
+
+POSE = {'x': 1.0, 'y': 2.0, 'heading': 90.0}
 
 
 def samples(*shape):
@@ -83,8 +88,30 @@ def test_many_pings_with_stamps_and_own_variances(convert):
 
 
 def test_without_stamps_pings_follow_the_rate(convert):
-    _, received, _ = convert({'ping_rate': 4.0}, Y=samples(3, 10, 4), time=RANGE / 750.0)
+    report, received, _ = convert({'ping_rate': 4.0}, Y=samples(3, 10, 4), time=RANGE / 750.0)
+    assert report.notes['stamps'] == 'the archive states none: 4 pings a second (--ping-rate)'
     assert np.diff([item.stamp_ns for item in received]).tolist() == [250_000_000] * 2
+    assert np.allclose(received[0].range, RANGE)
+
+
+SECONDS = 1_748_944_800 + np.array([0.0, 0.5, 1.25])
+
+
+@pytest.mark.parametrize(
+    'times',
+    [
+        {'Timestamps': SECONDS},
+        {'stamp': 1e3 * SECONDS},
+        {'stamp': (1e9 * SECONDS).astype(np.int64)},
+        {'ping_time': (1e6 * SECONDS).astype('M8[us]')},
+        {'time': SECONDS},
+    ],
+)
+def test_times_of_pings_in_other_units_and_by_other_names(convert, times):
+    report, received, _ = convert(iq=samples(3, 10, 4), range=RANGE, **times)
+    stamps = np.array([item.stamp_ns for item in received])
+    assert np.abs(stamps - (1e9 * SECONDS).astype(np.int64)).max() < 1000
+    assert not {'stamps', 'ignored arrays of pings.npz'} & set(report.notes)
     assert np.allclose(received[0].range, RANGE)
 
 
@@ -111,7 +138,9 @@ POSES = {
 EAST_NORTH = {'x': np.arange(3.0), 'y': np.full(3, 7.0), 'yaw': np.full(3, math.radians(60.0))}
 
 
-@pytest.mark.parametrize('poses', [POSES, EAST_NORTH])
+@pytest.mark.parametrize(
+    'poses', [POSES, {name.title(): value for name, value in POSES.items()}, EAST_NORTH]
+)
 def test_places_and_attitude_of_each_ping_become_navigation(convert, poses):
     more = {'z': -2.0, 'roll_deg': np.full(3, 5.0), 'pitch_rad': 0.1, 'altitude': 12.0}
     report, received, _ = convert(
@@ -121,7 +150,7 @@ def test_places_and_attitude_of_each_ping_become_navigation(convert, poses):
     assert report.messages == {'/nav': 3, '/altitude': 3, '/snapshot': 3}
     assert report.notes['ignored arrays of pings.npz'] == 'odd'
     poses_read = [item for item in received if isinstance(item, Navigation)]
-    step = (1e-5 * 111_414.0 if 'latitude' in poses else 0.0, 0.0 if 'latitude' in poses else 1.0)
+    step = (0.0, 1.0) if 'x' in poses else (1e-5 * 111_414.0, 0.0)
     for k, pose in enumerate(poses_read):
         north, east = step
         start = poses_read[0].position
@@ -135,6 +164,16 @@ def test_places_and_attitude_of_each_ping_become_navigation(convert, poses):
         assert starboard[2] == pytest.approx(-math.sin(math.radians(5.0)) * math.cos(0.1))
 
 
+def test_the_origin_of_degrees_counts_beside_other_parameters(convert, tmp_path):
+    convert(iq=samples(3, 30, 4), range=RANGES, **POSES)
+    params = tmp_path / 'my.yaml'
+    params.write_text('/**: {ros__parameters: {sonar_height: 12.0}}')
+    for chosen in (None, params):
+        (job,) = Plan(params=chosen).jobs(tmp_path / 'bag', tmp_path / 'out')
+        assert job.options.origin == Origin(59.43, 10.47)
+    assert job.config.sonar_height == 12.0
+
+
 @pytest.mark.parametrize(
     ('poses', 'words'),
     [
@@ -142,6 +181,7 @@ def test_places_and_attitude_of_each_ping_become_navigation(convert, poses):
         ({'x': np.zeros(3), 'y': np.zeros(3)}, '--name heading=ARRAY'),
         ({**POSES, 'roll': np.full(3, 0.1)}, '--name roll_rad=roll'),
         ({**POSES, 'heading': np.zeros(4)}, 'heading has the shape'),
+        ({**POSES, 'heading': np.full(3, 1.2)}, '--name heading_deg=heading'),
     ],
 )
 def test_navigation_that_can_be_read_in_two_ways_is_asked(convert, poses, words):
@@ -185,7 +225,8 @@ def test_bad_pings_are_left_out_and_named(convert):
     'options, arrays, word',
     [
         ({}, {'range': RANGE}, 'no array iq or'),
-        ({}, {'iq': samples(10, 4)}, 'no array time'),
+        ({}, {'iq': samples(10, 4)}, 'no array range or .* or time'),
+        ({}, {'iq': samples(1, 4, 10), 'range': RANGE, 'x': 0, 'y': 0, 'yaw': 0}, 'for 4 bins'),
         ({}, {'iq': np.ones((10, 4)), 'range': RANGE}, 'complex'),
         ({}, {'iq': samples(10), 'range': RANGE}, 'shape'),
         ({}, {'iq': samples(10, 4), 'range': RANGE[:9]}, 'nothing that could be converted'),
@@ -199,6 +240,7 @@ def test_bad_pings_are_left_out_and_named(convert):
          'one finite number'),
         ({'staves': [[0, 4], [1]]}, {'iq': samples(10, 4), 'range': RANGE}, 'channels 0 to 3'),
         ({'names': {'iq': 'data'}}, {'iq': samples(10, 4), 'range': RANGE}, "no array 'data'"),
+        ({}, {'iq': samples(10, 4), 'range': RANGE[:9], **POSE}, 'nothing that could be'),
         ({'names': {'data': 'iq'}}, {'iq': samples(10, 4), 'range': RANGE}, 'unknown array'),
         ({}, {'iq': np.array([{}]), 'range': RANGE}, 'more than plain arrays'),
     ],

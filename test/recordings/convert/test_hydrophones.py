@@ -62,6 +62,7 @@ def test_the_name_of_the_file_says_when_it_begins(tmp_path, name):
     sound(tmp_path / name)
     report = convert_hydrophones(tmp_path / name, tmp_path / 'out')
     assert blocks_of(report.path)[0].stamp_ns == BEGIN_NS
+    assert report.notes['start'].startswith('2024-05-31T10:00:00Z by the name')
     report = convert_hydrophones(tmp_path / name, tmp_path / 'zone', time_zone='+02:00')
     assert blocks_of(report.path)[0].stamp_ns == BEGIN_NS - 7200 * 10**9
 

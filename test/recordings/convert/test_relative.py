@@ -128,6 +128,27 @@ def test_a_vessel_that_heads_east_sees_what_is_ahead_and_to_starboard(
     assert last.state[0, :2] == pytest.approx([1030.0, 490.0], abs=0.01)
 
 
+@pytest.mark.parametrize(
+    'ahead, abeam', [('Forover (m)', 'Styrbord (m)'), ('Voraus', 'Steuerbord')]
+)
+def test_words_of_other_languages(convert, ahead, abeam):
+    text = f'Tid;x fartoy;y fartoy;heading;{ahead};{abeam}\n5;100;50;90;10;2\n'
+    assert tracked(convert(text)).state[0, :2] == pytest.approx([110.0, 48.0], abs=0.05)
+
+
+def test_one_word_of_two_is_asked_for_the_other(convert):
+    with pytest.raises(BagError, match='no column for starboard'):
+        convert('stamp,vessel_x,vessel_y,heading,forward,abeam\n5,1,2,90,10,2\n')
+
+
+def test_metres_of_a_truth_count_from_a_place_that_is_named(convert, tmp_path):
+    (tmp_path / 'truth.csv').write_text('stamp,x,y\n5,1,2\n')
+    text = 'stamp,vessel_latitude,vessel_longitude,heading,forward,starboard\n5,59,10,90,10,2\n'
+    report = convert(text, truth=tmp_path / 'truth.csv')
+    assert 'latitude 59, longitude 10' in report.notes['truth']
+    assert report.notes['origin'].startswith('latitude 59.0, longitude 10.0')
+
+
 def test_a_vessel_by_latitude_and_longitude_is_placed_exactly(convert):
     # Of one fix in a second, a new target is not probable yet: the second place has two.
     lines = ['5,60,10,45,500,0,.01', '6,60,10.18,45,500,0,.01', '7,60,10.18,45,500,0,.01']
@@ -259,7 +280,8 @@ def test_hostile_rows_cost_a_sentence_each(convert, kind, header, good, bad, wor
         ('relative', 'stamp,vessel_x,vessel_y,heading', {}, 'no column for range and bearing'),
         ('relative', 'stamp,vessel_x,vessel_y,forward,starboard', {}, 'no column for heading'),
         ('relative', 'stamp,heading,forward,starboard', {}, 'no column for vessel_x and vessel_y'),
-        ('relative', GPS, {'origin': (91.0, 0.0)}, 'an origin is'),
+        ('relative', GPS, {}, 'heading may be degrees or radians'),
+        ('relative', GPS.replace('heading', 'heading_deg'), {'origin': (91.0, 0.0)}, 'an origin'),
     ],
 )
 def test_a_table_that_says_too_little_is_told_what_is_missing(

@@ -144,6 +144,10 @@ def test_the_recording_delay_of_each_trace(tmp_path, words, delay):
 def test_the_sample_interval_of_each_trace_or_of_the_file(tmp_path):
     line = read_segy(write(tmp_path / 'a.sgy', interval=[100, 0, 50], of_file={'interval': 80}))
     assert line.interval == pytest.approx([1e-4, 8e-5, 5e-5])
+    assert not line.questions
+    line = read_segy(write(tmp_path / 'c.sgy', interval=[100, 100, 50], of_file={'interval': 80}))
+    (question,) = line.questions
+    assert '100 us in the trace headers and 80 us' in question and '0.8 times' in question
     line = read_segy(write(tmp_path / 'b.sgy', interval=40_000))
     assert line.interval == pytest.approx(0.04)  # unsigned
 

@@ -72,10 +72,13 @@ def test_port_may_be_told_from_far_to_near(order, first):
     assert found['starboard'][0]['samples'][0] == 1.0 and set(found) == {'port', 'starboard'}
 
 
-@pytest.mark.parametrize('clipped', [0, 1, 2])
-def test_more_than_a_hundredth_at_full_scale_is_said(clipped, tmp_path):
+@pytest.mark.parametrize(
+    'clipped, top, full',
+    [(0, 32767, 0), (1, 32767, 1), (2, 32767, 2), (2, 4095, 2), (9, 4000, 0), (50, 15, 0)],
+)
+def test_more_than_a_hundredth_at_full_scale_is_said(clipped, top, full, tmp_path):
     samples = np.ones(100, np.int16)
-    samples[:clipped] = 32767
+    samples[:clipped] = top
     how, report = XtfOptions(), ConversionReport(tmp_path)
     seen = side_scan._Seen(how)
     image = side_scan._image(
@@ -83,8 +86,8 @@ def test_more_than_a_hundredth_at_full_scale_is_said(clipped, tmp_path):
     )
     seen.image(image, [channel(samples)], 1)
     seen.tell(tmp_path / 'a.xtf', report)
-    assert seen.clipped == clipped and seen.samples == 100
-    assert any('full scale' in question for question in report.questions) == (clipped > 1)
+    assert seen.clipped == full and seen.samples == 100
+    assert any('full scale' in question for question in report.questions) == (full > 1)
 
 
 def test_samples_at_full_scale_are_those_of_the_frequency_that_is_used(tmp_path):

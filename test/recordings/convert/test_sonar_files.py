@@ -105,6 +105,28 @@ class TestXtf:
         nav = read(tmp_path / 'metres', 'obstacle', Navigation)[-1]
         assert nav.position[:2] == pytest.approx([10.0, 54.0], abs=0.01)
 
+    @pytest.mark.parametrize(
+        'units, wanted',
+        [(3, 'its places are degrees, and they are'), (7, 'does not say the unit')],
+    )
+    def test_metres_that_a_file_calls_otherwise_are_asked(self, tmp_path, units, wanted):
+        head = xtf_head(SIDES)
+        head.NavUnits = units
+        pings = [xtf_ping(0.2 * k, [echo(-1), echo(300)], (5e6, 4e5 + k)) for k in range(9)]
+        (tmp_path / 'a.xtf').write_bytes(b''.join([head.to_bytes(), *pings]))
+        with pytest.raises(BagError, match=f'{wanted}.*400000, 5000000.*--units metres'):
+            convert_xtf(tmp_path / 'a.xtf', tmp_path / 'bag')
+        convert_xtf(tmp_path / 'a.xtf', tmp_path / 'bag', units='metres')
+        nav = read(tmp_path / 'bag', 'obstacle', Navigation)[-1]
+        assert nav.position[:2] == pytest.approx([4e5 + 8.0, 5e6])
+
+    def test_a_file_of_the_other_side_names_its_option(self, tmp_path):
+        pings = [xtf_ping(0.2 * k, [echo(300)]) for k in range(3)]
+        path = xtf(tmp_path / 'a.xtf', pings, SIDES[:1])
+        with pytest.raises(BagError, match='channels of port alone: --side port'):
+            convert_xtf(path, tmp_path / 'bag')
+        assert convert_xtf(path, tmp_path / 'bag', side='port').messages['/detections'] == 3
+
     def test_metres_near_the_origin_are_no_question(self, tmp_path):
         head = xtf_head(SIDES)
         head.NavUnits = 0
@@ -136,6 +158,11 @@ class TestXtf:
             (
                 {'SensorYcoordinate': 0.0, 'SensorXcoordinate': 0.0, 'ShipYcoordinate': 54.0,
                  'ShipXcoordinate': 10.0, 'Layback': 25.0},
+                echo(300),
+                'up to 25 m behind',
+            ),
+            (
+                {'ShipYcoordinate': 54.0, 'ShipXcoordinate': 10.0, 'Layback': 25.0},
                 echo(300),
                 'up to 25 m behind',
             ),

@@ -124,8 +124,8 @@ def test_decorrelation_is_noise_that_grows_with_the_echo():
     config = scenario('paper', {'pings': 1, 'last_range': 20.0})
     ping = simulate(config, 1).measurements[0].measurement
     given = BathymetryConfig(
-        model_set='height_two_rw', decorrelation=0.25, engine='grid', gate_false_alarm=1.0,
-        sound_speed_std=2.0,
+        model_set='height_two_rw', decorrelation=0.25, engine='gaussian',
+        gate_false_alarm=1.0, sound_speed_std=2.0,
     )  # fmt: skip
     each = BathymetryTracker(given).process(ping)[0]
     signal = np.maximum(

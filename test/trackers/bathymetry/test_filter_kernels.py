@@ -12,14 +12,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from oracles import bin_likelihood
 from oracles import imm_particles as oracle
+from oracles.bin_likelihood import exponentials, phasors
 import pytest
 from scipy import stats
 
 from sonar_imm.acoustics import interference, laplace, rays
 from sonar_imm.acoustics.laplace import likelihood_table
-from sonar_imm.trackers.bathymetry import grid_kernels as kernels
-from sonar_imm.trackers.bathymetry import ping
+from sonar_imm.trackers.bathymetry import bins, ping
 from sonar_imm.trackers.bathymetry.filter_kernels import normals
 from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 
@@ -67,7 +68,7 @@ def make_case(
             depth_step=table.depth_step,
         )
     arrays = (np.ascontiguousarray(part) for part in (form, base, spread, signal))
-    likelihood = kernels.PingLikelihood(
+    likelihood = bins.PingLikelihood(
         ranges, np.array(echo), *arrays, ones, np.zeros(T), likelihood_table(P), geometry
     )
     models = SimpleNamespace(
@@ -78,7 +79,7 @@ def make_case(
         favour=rng.uniform(0.2, 2.0, (T, M)) if favours else np.empty((0, M)),
     )
     return SimpleNamespace(
-        start=kernels.Particles(x, w, probability if mu is None else mu), models=models,
+        start=bins.Particles(x, w, probability if mu is None else mu), models=models,
         chains=np.stack([ASYMMETRIC if mu is None else np.eye(M), np.eye(M)][: 1 + again]),
         uniform=rng.random((T, 2, M)), noise=rng.normal(size=(T, M, 2, N)), ping=likelihood,
     )  # fmt: skip
@@ -86,9 +87,9 @@ def make_case(
 
 def compiled(case):
     """Mean, covariance, probability, log likelihood and sample size of each bin; the particles."""
-    state = kernels.Particles(*(part.copy() for part in case.start))
+    state = bins.Particles(*(part.copy() for part in case.start))
     T = len(case.noise)
-    track = kernels.Track(
+    track = bins.Track(
         np.empty((T, 2)), np.empty((T, 2, 2)), np.empty((T, M)), np.empty(T), np.empty(T)
     )
     for part in (slice(0, T // 2), slice(T // 2, T)):  # a ping is filtered block by block
@@ -101,15 +102,11 @@ def in_numpy(case):
     told, g = case.ping, case.ping.geometry
 
     def look(state, t):
-        out = np.empty(N)
-        kernels.state_log_likelihoods(state, told, t, np.empty(N), np.empty((4, N)), out)
-        return out
+        return bin_likelihood.state_log_likelihoods(state, told, t)
 
     def drift(state, t):
-        out = state.copy()
-        if not g.of_heights and t >= g.drift_from:
-            kernels.drift(state, t, g, out)
-        return out
+        moves = not g.of_heights and t >= g.drift_from
+        return bin_likelihood.drift(state, t, g) if moves else state.copy()
 
     answers, x, w = oracle.filter_bins(
         *case.start, case.models, case.chains, case.uniform, case.noise, told.echo, look, drift
@@ -200,6 +197,22 @@ def test_a_model_that_hardly_anything_can_become_stays_finite(tiny):
     case = make_case([True], mu=mu)
     for found, expected in zip(compiled(case), in_numpy(case)):
         assert np.array_equal(found, expected)
+
+
+def test_exponentials_are_those_of_the_library():
+    values = np.concatenate([-np.logspace(-18, np.log10(699.0), 20_001), np.linspace(-2, 0, 9999)])
+    exact = np.exp(values)
+    assert (np.abs(exponentials(values) - exact) <= 4e-16 * exact).all()
+    nothing = np.array([-np.inf, np.nan, -701.0, -1e300])
+    assert (exponentials(nothing) == 0.0).all() and exponentials(np.zeros(1)) == 1.0
+
+
+def test_phasors_are_cosines_and_sines():
+    values = np.append(np.linspace(-60.0, 60.0, 4001), np.nan)
+    cosine, sine = phasors(values, 0.7)
+    assert np.abs(cosine - np.cos(1.4 * np.pi * values))[:-1].max() < 1e-13
+    assert np.abs(sine - np.sin(1.4 * np.pi * values))[:-1].max() < 1e-13
+    assert np.isnan(cosine[-1]) and np.isnan(sine[-1])
 
 
 @pytest.fixture(scope='module')

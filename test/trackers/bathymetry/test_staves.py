@@ -105,9 +105,9 @@ def test_phases_leave_a_tilt_that_all_bins_share():
     phase = np.radians([14.0, -20.0, 9.0, 25.0, -16.0, 0.0, -12.0, 20.0])
     scores, tracker, made = tracked(pings(lambda iq: iq * np.exp(1j * phase).astype(np.complex64)))
     (sentence,) = tracker.warnings()
-    assert 'are off in phase by' in sentence and 'leaves the tilt uncertain by 0.' in sentence
+    assert 'are off in phase by' in sentence and 'leaves the tilt uncertain by 1.1' in sentence
     left = tracker.health()['phase_tilt_deg']
-    assert 0.4 < left < 1.2 and scores['inside'] > 0.9
+    assert 1.0 < left < 1.2 and scores['inside'] > 0.9
     aside = np.abs(made[-1]['y']) / np.cos(made[-1]['angle'])
     assert made[-1]['geometry_std'] == pytest.approx(np.radians(left) * aside, rel=1e-3)
 

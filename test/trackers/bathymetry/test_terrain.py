@@ -332,6 +332,21 @@ def test_a_shadow_widens_what_is_known(kept):
     assert made.probabilities.sum(axis=1) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize('silent, goes_on', [(50, True), (70, False)])
+def test_the_chain_goes_on_in_narrow_gaps_only(silent, goes_on):
+    ranges, steps = 20.0 + 0.05 * np.arange(300), 30
+    ping = floor(0.1 * (ranges - 20.0), ranges=ranges, shadow=slice(120, 120 + silent))
+    (made,) = BathymetryTracker(evolve(TERRAIN, smoothing='none')).process(ping)
+    valid = np.flatnonzero(made.extras['valid'])
+    last = valid[valid < 130][-1]
+    assert valid[valid > last][0] >= 120 + silent
+    before, after = made.probabilities[[last, last + steps]]
+    if goes_on:
+        before = before @ np.linalg.matrix_power(terrain_of(0.05).transition, steps)
+    assert after == pytest.approx(before, abs=1e-9) and np.ptp(before) > 0.1
+    assert (made.extras['log_likelihood'][last + 1 : last + steps] == 0.0).all()
+
+
 def test_nothing_but_noise_is_the_start():
     ranges = 20.0 + 0.05 * np.arange(50)
     ping = floor(0.0, ranges=ranges, shadow=slice(0, 50))
@@ -352,8 +367,8 @@ def test_nothing_but_noise_is_the_start():
         ({'engine': 'particles'}, 'terrain runs on engine gaussian, not on particles'),
         ({'smoothing': 'modes'}, 'terrain smooths states, or nothing'),
         (
-            {'model_set': 'height_two_rw', 'engine': 'gaussian'},
-            'gaussian is for model_set terrain',
+            {'model_set': 'angle_two_rw', 'engine': 'gaussian'},
+            'gaussian is for terrain and height_two_rw',
         ),
     ],
 )

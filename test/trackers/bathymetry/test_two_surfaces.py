@@ -146,7 +146,7 @@ def test_existence_and_heights_of_the_prototype(monkeypatch):
         {},
         {'model_set': 'height_rw_ncs'},
         {'model_set': 'angle_two_rw'},
-        {'model_set': 'height_two_rw', 'engine': 'grid'},
+        {'model_set': 'height_two_rw'},
     ],
 )
 def test_both_heights_of_a_step(values):
@@ -300,7 +300,7 @@ def test_surface_echoes_leave_layover_alone():
     'staves, values',
     [
         (8, {}),
-        (8, {'model_set': 'height_two_rw', 'engine': 'grid'}),
+        (8, {'model_set': 'height_two_rw'}),
         (3, {}),
     ],
 )

@@ -51,25 +51,16 @@ def test_error_falls_with_the_root_of_the_number_of_particles(name):
     assert 2.8 < few / many < 5.7
 
 
-@pytest.mark.parametrize('name', SCALAR)
-def test_the_grid_is_the_exact_filter(name):
+@pytest.mark.parametrize('name', ['set_ii_0', 'set_ii_1'])
+def test_gaussians_in_place_of_two_walks_are_near(name):
+    """A walk of 1 cm next to one of half a metre: what mixes is no Gaussian."""
     case, config, snapshot = vector(name)
-    estimate = run(evolve(config, engine='grid'), snapshot)
+    estimate = run(evolve(config, engine='gaussian'), snapshot)
     deviation, dmu = errors(case, estimate)
-    assert deviation.max() < 1e-3 and dmu.max() < 1e-4
-    assert estimate.covariance[:, 0, 0] == pytest.approx(case['v'], rel=1e-3)
+    assert deviation.mean() < 0.2 and dmu.mean() < 0.015
 
 
-@pytest.mark.parametrize('name', SCALAR)
-def test_the_grid_smoother_is_the_exact_smoother(name):
-    case, config, snapshot = vector(name)
-    estimate = run(evolve(config, engine='grid', smoothing='states'), snapshot)
-    deviation, dmu = errors(case, estimate, 's_m', 's_v', 's_mu')
-    assert deviation.max() < 1e-3 and dmu.max() < 2e-4
-    assert estimate.covariance[:, 0, 0] == pytest.approx(case['s_v'], rel=1e-3)
-
-
-@pytest.mark.parametrize('engine, tolerance', [('grid', 2e-4), ('particles', 0.05)])
+@pytest.mark.parametrize('engine, tolerance', [('gaussian', 0.08), ('particles', 0.02)])
 def test_log_likelihood_of_each_bin(engine, tolerance):
     """The reference leaves out what does not depend on the direction; so do differences."""
     case, config, snapshot = vector('set_ii_0')

@@ -53,10 +53,15 @@ def relative(second, offset, **values):
 # -- latitude and longitude ----------------------------------------------------------------------
 
 
-def test_positions_on_earth_give_the_track_of_the_same_positions_in_metres():
+@pytest.mark.parametrize('away', [1e3, 1e5])
+def test_positions_on_earth_give_the_track_of_the_same_positions_in_metres(away):
+    """Also 100 km from the origin, where its plane is 785 m above the ellipsoid."""
     config = DiverConfig(origin=(59.0, 10.0, 0.0))
-    path = [(1000.0 + 0.7 * k, 500.0 - 0.3 * k, 0.0) for k in range(30)]
-    on_earth = run(DiverTracker(config), [geodetic(k + 1, p) for k, p in enumerate(path)])
+    path = [(away + 0.7 * k, 500.0 - 0.3 * k, 0.0) for k in range(30)]
+    places = [ORIGIN.at_height(np.array(p[:2])) for p in path]
+    ups = [ORIGIN.local(*place)[2] for place in places]
+    whole = [(*p[:2], up) for p, up in zip(path, ups)]
+    on_earth = run(DiverTracker(config), [geodetic(k + 1, p) for k, p in enumerate(whole)])
     metres = run(
         DiverTracker(config),
         [
@@ -67,9 +72,10 @@ def test_positions_on_earth_give_the_track_of_the_same_positions_in_metres():
     assert on_earth[-1].frame_id == 'map'
     assert on_earth[-1].state == pytest.approx(metres[-1].state, abs=1e-6)
     assert on_earth[-1].covariance == pytest.approx(metres[-1].covariance, rel=1e-3)
-    latitude, longitude, _ = ORIGIN.geodetic(np.array([*metres[-1].state[0, :2], 0.0]))
-    assert on_earth[-1].extras['latitude'] == pytest.approx([latitude], abs=1e-11)
-    assert on_earth[-1].extras['longitude'] == pytest.approx([longitude], abs=1e-11)
+    latitude, longitude = (on_earth[-1].extras[name][0] for name in ('latitude', 'longitude'))
+    expected = ORIGIN.at_height(metres[-1].state[0, :2])
+    assert [latitude, longitude] == pytest.approx(expected[:2], abs=1e-10)
+    assert np.hypot(*Origin(*places[-1][:2]).local(latitude, longitude)[:2]) < 0.5
 
 
 def test_the_first_position_is_the_origin_unless_one_is_stated_and_reset_forgets_it():

@@ -155,6 +155,21 @@ def test_all_keep_their_ids_when_a_great_error_is_followed():
     assert all(ids == late[0] for ids in late)
 
 
+def test_the_last_records_say_where_the_layers_lie_once_an_error_is_followed():
+    error = 0.5 * np.random.default_rng(16).standard_normal(12)
+    traces, true = scene(error, 2, 12)
+    _, found = run(traces, **FEW)
+    first = next(k for k in range(1, 13) if found[k * 10**9].extras['heave_std'][0] > 0.0)
+    off = found[first * 10**9].state[:, 0] - true[first - 1]
+    # Layers that stay are where the mean of the records has them, not where the newest shows them.
+    eight = error[first - 8 : first].mean()
+    assert abs(error[first - 1] - eight) > 0.5
+    np.testing.assert_allclose(off, eight, atol=0.1)
+    assert found[first * 10**9].extras['heave'][0] == pytest.approx(
+        error[first - 1] - eight, abs=0.1
+    )
+
+
 def test_what_all_are_off_by_together():
     known = Identities(tuple(Identified(k, z, 0) for k, z in enumerate((50.0, 54.0, 61.0, 66.0))))
     seen = np.array([50.9, 54.92, 57.0, 66.9])

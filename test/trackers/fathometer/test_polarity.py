@@ -135,9 +135,8 @@ def test_what_auto_stands_for(hydrophones, changes, expected):
     assert settled.settled(0) is settled
 
 
-def test_envelopes_have_no_negative_reflectors():
+def test_reflectors_are_negative_where_both_signs_are_asked_for():
     assert FathometerConfig(polarity='both').negative_share == 0.05
-    assert FathometerConfig(polarity='both', remove_background=True).negative_share == 0.0
     assert FathometerConfig(polarity='positive').negative_share == 0.0
     with pytest.raises(ConfigError, match='negative_probability'):
         FathometerConfig(negative_probability=1.0)

@@ -135,12 +135,12 @@ def test_what_sways_farther_counts_as_swaying():
     """Seen from outside there are three behaviours; how far an obstacle sways never changes."""
     filter_ = BehaviourSlices(ObstacleConfig())
     chain = filter_._transition(0.5)
-    change = chain[0, 3]
-    fixed, near, far, moving = range(4)
+    change = chain[0, 4]
+    fixed, near, far, _, begun_moving = range(5)
     np.testing.assert_allclose(chain.sum(axis=1), 1.0, rtol=1e-15)
     assert chain[near, far] == chain[far, near] == 0.0
     assert chain[fixed, near] + chain[fixed, far] == pytest.approx(change)
-    assert chain[near, moving] == chain[far, moving] == change
+    assert chain[near, begun_moving] == chain[far, begun_moving] == change
     assert change == pytest.approx(0.5 * 0.5 / 1000.0, rel=1e-3)
     sonar = Sonar(Pose(np.array([0.0, 0.0, 20.0]), np.eye(3)), 15.0)
     begun = filter_.begin(np.array([[60.0, 0.1]]), np.diag([0.02, 2e-5])[None], sonar)

@@ -31,9 +31,9 @@ def poses(rng):
 
 
 def targets(rng, before, slices=2, T=2, errors=0.0):
-    """Components fixed, swaying, swaying farther, moving of each slice, one more is fixed; errors:
-    how much is unknown of the navigation."""
-    C = 4 * slices + 1
+    """Components of each slice: fixed, swaying, swaying farther, moving, begun to; one more is
+    fixed. errors: how much is unknown of the navigation."""
+    C = 5 * slices + 1
     x = np.zeros((T, C, 10))
     x[..., 0] = rng.uniform(30.0, 90.0, (T, C))
     x[..., 1] = rng.uniform(-0.3, 0.3, (T, C))
@@ -44,7 +44,7 @@ def targets(rng, before, slices=2, T=2, errors=0.0):
     scale = np.array([0.2, 0.004, 1.5, *navigation, 0.3, 0.3])
     A = rng.normal(size=(T, C, 10, 10)) * scale[:, None]
     P = A @ np.swapaxes(A, -1, -2)
-    fixed = np.arange(C) % 4 == 0
+    fixed = np.arange(C) % 5 == 0
     x[:, fixed, 8:] = 0.0
     P[:, fixed, 8:, :] = P[:, fixed, :, 8:] = 0.0
     return x, P, rng.dirichlet(np.ones(C), T)
@@ -55,11 +55,14 @@ def motion(dt=0.5, slices=2):
     return BehaviourSlices(config)._motion(dt)
 
 
-CHAIN = np.full((4, 4), 0.02) + np.diag([0.92, 0.92, 0.9, 0.92])
+CHAIN = np.full((5, 5), 0.02) + np.diag([0.9, 0.9, 0.88, 0.9, 0.82])
 CHAIN[2, 3] += 0.02
+CHAIN[4, 3] += 0.08
+SAME = np.eye(5, dtype=bool)
+SAME[1, 2] = SAME[2, 1] = SAME[3, 4] = SAME[4, 3] = True
 
 
-def numpy_mix(x, P, mu, prior, slices, chain):
+def numpy_mix(x, P, mu, prior, slices, chain, same):
     """The mixing written out: sources as they look to each behaviour, then moments."""
     x1, P1, mu1, M = x.copy(), P.copy(), mu.copy(), len(chain)
     for t in range(len(x)):
@@ -68,12 +71,9 @@ def numpy_mix(x, P, mu, prior, slices, chain):
             mu1[t, own] = mu[t, own] @ chain
             for a in range(M):
                 share = mu[t, own] * chain[:, a] / mu1[t, k * M + a]
-                kept = share[a]
-                share *= np.where(np.arange(M) == a, kept, 1.0 - kept)
-                share /= share.sum()
                 means, covariances = x[t, own].copy(), P[t, own].copy()
                 for i in range(M):
-                    if i != a:
+                    if not same[i, a]:
                         means[i, 8:] = 0.0
                         covariances[i, 8:, :] = covariances[i, :, 8:] = 0.0
                         covariances[i, 8:, 8:] = np.eye(2) * prior[k * M + a]
@@ -91,42 +91,51 @@ def test_mixing_equals_numpy():
     before, _ = poses(rng)
     x, P, mu = targets(rng, before, errors=1.0)
     prior = motion().prior
-    got = mixtures.mix(x, P, mu, prior, 2, CHAIN, 0.0)
-    for mine, plain in zip(got, numpy_mix(x, P, mu, prior, 2, CHAIN)):
+    got = mixtures.mix(x, P, mu, prior, 2, CHAIN, SAME, 0.0)
+    for mine, plain in zip(got, numpy_mix(x, P, mu, prior, 2, CHAIN, SAME)):
         assert_allclose(mine, plain, rtol=1e-12, atol=1e-15)
     assert_allclose(got[2].sum(axis=1), 1.0)
     assert np.all(got[1] == np.swapaxes(got[1], -1, -2))
 
 
-def test_what_is_known_of_a_velocity_outlasts_a_little_that_comes_in_each_step():
-    """A hundred steps in which one part in 50 of what moves began to just then."""
+def test_what_begins_to_move_leaves_the_velocity_of_what_moves_alone():
+    slices = BehaviourSlices(ObstacleConfig(components=1))
+    chain, prior = slices._transition(0.5), slices._motion(0.5).prior
+    assert_allclose(chain.sum(axis=1), 1.0)
+    fixed, _, _, moves, begun = range(5)
+    assert chain[fixed, moves] == chain[moves, begun] == 0.0 < chain[fixed, begun]
+    assert chain[begun, moves] == pytest.approx(-np.expm1(-0.1), rel=1e-3)
     rng = np.random.default_rng(3)
     before, _ = poses(rng)
     x, P, mu = targets(rng, before, slices=1, T=1)
-    x[:, 3, 8:], P[:, 3, 8:] = 0.1, 0.0
-    P[:, 3, :, 8:] = 0.0
-    P[:, 3, 8, 8] = P[:, 3, 9, 9] = 0.03**2
-    prior, chain = np.array([0.0, 0.25, 1.0, 0.5625, 0.0]), np.eye(4)
-    chain[0] = [0.9998, 0.0, 0.0, 0.0002]
-    mu[:] = [0.98, 0.0, 0.0, 0.01, 0.01]
+    x[:, moves, 8:], P[:, moves, 8:] = 0.1, 0.0
+    P[:, moves, :, 8:] = 0.0
+    P[:, moves, 8, 8] = P[:, moves, 9, 9] = 0.03**2
+    x[:, begun, 8:], P[:, begun] = 0.1, P[:, moves]
+    mu[:] = [0.97, 0.0, 0.0, 0.01, 0.01, 0.01]
+    x1, P1 = x, P
     for _ in range(100):
-        x, P, _ = mixtures.mix(x, P, mu, prior, 1, chain, 0.0)
-    assert np.all((x[0, 3, 8:] > 0.08) & (np.sqrt(np.diagonal(P[0, 3])[8:]) < 0.15))
-    mu[:] = [0.98, 0.0, 0.0, 1e-6, 0.02]  # now it is nearly all that came
-    x, P, _ = mixtures.mix(x, P, mu, prior, 1, chain, 0.0)
-    assert_allclose(np.diagonal(P[0, 3])[8:], 0.5625, rtol=0.02)
+        x1, P1, _ = mixtures.mix(x1, P1, mu, prior, 1, chain, slices._same, 0.0)
+        # What settles has the velocity that it had as what has just begun, unlike what begins.
+        x1[:, begun, 8:], P1[:, begun] = 0.1, P[:, moves]
+    assert_allclose(x1[0, moves, 8:], 0.1, rtol=1e-9)
+    assert_allclose(np.diagonal(P1[0, moves])[8:], 0.03**2, rtol=1e-9)
+    x1, P1, _ = mixtures.mix(x, P, mu, prior, 1, chain, slices._same, 0.0)
+    share = mu[0, fixed] * chain[fixed, begun]
+    share /= share + mu[0, begun] * chain[begun, begun]
+    assert_allclose(x1[0, begun, 8:], (1.0 - share) * x[0, begun, 8:])
 
 
 def test_mixing_leaves_depth_slices_alone_and_drops_the_improbable():
     rng = np.random.default_rng(2)
     before, _ = poses(rng)
     x, P, mu = targets(rng, before)
-    mu[:, 4:8] *= 1e-9
+    mu[:, 5:10] *= 1e-9
     mu /= mu.sum(axis=1, keepdims=True)
-    x1, P1, mu1 = mixtures.mix(x, P, mu, motion().prior, 2, CHAIN, 1e-6)
-    assert np.all(mu1[:, 4:8] == 0.0)
-    assert_allclose(mu1[:, :4].sum(axis=1) / mu1[:, 8], mu[:, :4].sum(axis=1) / mu[:, 8])
-    assert np.all(x1[:, 8] == x[:, 8]) and np.all(P1[:, 8] == P[:, 8])
+    x1, P1, mu1 = mixtures.mix(x, P, mu, motion().prior, 2, CHAIN, SAME, 1e-6)
+    assert np.all(mu1[:, 5:10] == 0.0)
+    assert_allclose(mu1[:, :5].sum(axis=1) / mu1[:, 10], mu[:, :5].sum(axis=1) / mu[:, 10])
+    assert np.all(x1[:, 10] == x[:, 10]) and np.all(P1[:, 10] == P[:, 10])
 
 
 @pytest.mark.parametrize('kind', ['swaying', 'moving'])
