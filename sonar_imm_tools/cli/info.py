@@ -33,12 +33,15 @@ def command(bag: Path, strict: bool, as_json: bool) -> None:
     """
     from ..offline.inspection import inspect
     from ..recordings.reader import BagReader
+    from ..recordings.topics import system_in_mind, types_heard
 
     with BagReader(bag, strict=strict) as reader:
         total = sum(topic.count for topic in reader.topics)
         with progress('reading', total, quiet=as_json) as advance:
             found = inspect(reader, advance, _detector(bag))
-    print_json(found) if as_json else _print(found)
+        suits = any(topic['suits'] for topic in found['topics'])
+        heard = '' if suits or not total else types_heard(system_in_mind(reader))
+    print_json(found) if as_json else _print(found, heard)
     if not found['systems']:
         raise click.exceptions.Exit(1)
 
@@ -50,7 +53,7 @@ def _detector(bag: Path) -> dict[str, Any]:
     return load_detector(SYSTEMS['obstacle'], own_parameters(bag), {})
 
 
-def _print(found: dict[str, Any]) -> None:
+def _print(found: dict[str, Any], heard: str) -> None:
     say(f'{found["bag"]}: {found["messages"]} messages in {found["duration_s"]:.1f} s')
     for topic in found['topics']:
         rate = f', {topic["rate_hz"]:.3g} Hz' if topic['rate_hz'] else ''
@@ -72,7 +75,7 @@ def _print(found: dict[str, Any]) -> None:
     if not found['systems']:
         images = any(topic['type'].endswith('SonarImage') for topic in found['topics'])
         hint = '; of amplitude and phase sonar-imm convert interferometer makes snapshots'
-        say('no tracker can use it' + (hint if images else ''))
+        say('no tracker can use it' + (hint if images else heard))
 
 
 def _scans(scans: dict[str, int] | None) -> str:

@@ -347,14 +347,14 @@ def _nothing_fits(bag: BagReader, system: str) -> str:
         for entry in inputs_of(system)
         if entry.may_be(topic.name, topic.type_name) and 'truth' not in topic.name.split('/')
     ]
-    hint = f'; name the topic to use {" or ".join(maybe)}' if maybe else _types_heard(system)
+    hint = f'; name the topic to use {" or ".join(maybe)}' if maybe else types_heard(system)
     return (
         f'{bag.path} has no topic for the {system} tracker, which hears {wanted}; '
         f'there are {there}{hint}'
     )
 
 
-def _types_heard(system: str) -> str:
+def types_heard(system: str) -> str:
     """Return which types the first inputs of a tracker take."""
     entries = [entry for entry in inputs_of(system) if not entry.companion][:TYPES_NAMED]
     takes = [f'{entry.name} takes {", ".join(entry.readers)}' for entry in entries]

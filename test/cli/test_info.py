@@ -193,6 +193,8 @@ def test_a_type_that_nobody_hears_names_what_would_do(tmp_path, capsys):
     sentence = capsys.readouterr().err
     assert kind in sentence and 'PoseWithCovarianceStamped' in sentence
     assert 'diver' in sentence and 'bathymetry' not in sentence
+    assert main(['info', str(tmp_path / 'dive')]) == 1
+    assert 'fix takes geometry_msgs/msg/PoseWithCovarianceStamped' in capsys.readouterr().out
 
 
 def test_both_sides_of_a_side_scan(tmp_path, capsys):
