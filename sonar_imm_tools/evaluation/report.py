@@ -155,7 +155,6 @@ def write_report(path: Path, parts: Sequence[Part]) -> None:
         write_page(path, report_html(parts[0]))
         return
     folder = path.with_name(f'{path.stem}_runs')
-    folder.mkdir(parents=True, exist_ok=True)
     plotlyjs = packed(_plotlyjs())
     write_page(folder / PLOTLYJS, f"const packedPlotlyJs = '{plotlyjs}';\n")
     names = page_names(parts)

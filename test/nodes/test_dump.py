@@ -24,6 +24,7 @@ from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.fathometer import FathometerNode
 from sonar_imm.nodes.fls_detector import FlsDetectorNode
 from sonar_imm.nodes.obstacle import ObstacleNode
+from sonar_imm.nodes.running import warn_of_foreign_files
 from sonar_imm.parameters import ConfigError, sections_of
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main
@@ -87,7 +88,11 @@ def test_a_dump_of_the_detector_holds_all_and_loads_again(make_bench, tmp_path, 
     second = again.add(FlsDetectorNode(context=again.context))
     again.spin_until(lambda: second.state == 'active')
     assert dumped(again, '/fls_detector') + other == file.read_text()
+    warn_of_foreign_files(second, ['--params-file', str(file)])
     assert 'has no effect' not in capfd.readouterr().err
+    file.write_text(other)
+    warn_of_foreign_files(second, ['--params-file', str(file)])
+    assert 'has no effect: it is for another_node' in capfd.readouterr().err
 
 
 def test_a_file_for_another_node_is_named(tmp_path):

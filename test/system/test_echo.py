@@ -66,6 +66,7 @@ def test_estimates_are_found_and_shown(playing):
         name: (*echo.communicate(timeout=120), echo.returncode) for name, echo in echoes.items()
     }
     lines = values['lines'][0].splitlines()
+    assert 'listening to /diver/estimate' in values['lines'][1]
     assert values['lines'][2] == 0 and lines[0].startswith('/diver/estimate  20')
     assert 'frame map  1 row' in lines[0] and lines[1].split()[2:4] == ['px', 'py']
     assert '±' in lines[2] and re.search(r'(heading_\d{3}|hover|lively_\w+|quiet) +\d+%', lines[2])

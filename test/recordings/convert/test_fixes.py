@@ -231,7 +231,12 @@ def test_a_stated_velocity_is_kept(convert):
     report = convert('time,x,y,vx,vy\n5,0,0,0.1,0.2\n6,9,9,,0.4\n', kind='truth')
     first, second = truth_of(report.path)
     assert first.extras['vx'][0] == 0.1 and np.isnan(second.extras['vx'][0])
-    assert report.notes['truth_velocity'] == 'stated'
+    assert report.notes['truth_velocity'] == 'stated' and 'origin' not in report.notes
+
+
+def test_truth_in_degrees_notes_its_origin(convert):
+    report = convert('time,latitude,longitude\n5,54.0,10.0\n6,54.0,10.1\n', kind='truth')
+    assert report.notes['origin'] == 'latitude 54.0, longitude 10.0, height 0.0'
 
 
 def test_difference_velocity_is_exact_for_constant_speed():
