@@ -47,7 +47,8 @@ ORDERS: dict[str, Any] = {
     'order_transition_matrix': (0.6, 0.2, 0.2, 0.2, 0.6, 0.2, 0.2, 0.2, 0.6),
 }
 """The numbers of reflectors in the paper."""
-ENVELOPE: dict[str, Any] = {**ORDERS, 'pulse': 'envelope'}
+ENVELOPE: dict[str, Any] = {**ORDERS, 'pulse': 'envelope', 'water': 'off'}
+"""Of envelopes as the paper takes them, not as those of a profiler."""
 PENALTY: dict[str, Any] = {'amplitude_prior': 'paper'}
 """Of `SetModel`: the best amplitudes of a set, with a factor 1 / N for each of them."""
 BOOTSTRAP: dict[str, Any] = {'walk_share': 0.0, 'birth_share': 0.0}

@@ -86,12 +86,14 @@ class Ages:
         if now - when[-1] > max(WINDOW, PERIODS * period):
             return AgeReport({})  # silence is told as such
         limit = limit or max(LEAST_LIMIT, PERIODS * period)
+        off, clock = p50 - waited, ''
+        if LONGEST_DELAY < off < LONGEST_OFFSET or -LONGEST_OFFSET < off < -LEAST_LIMIT:
+            way = 'behind' if off > 0.0 else 'ahead of'
+            clock = f'stamps are {abs(off):.0f} s {way} the clock of this computer: one is off'
         if waited > limit:
             slow = f'estimates are {waited:.1f} s old: input comes faster than it can be processed'
-            return AgeReport(values, slow)
-        if LONGEST_DELAY < p50 < LONGEST_OFFSET or -LONGEST_OFFSET < p50 < -LEAST_LIMIT:
-            way = 'behind' if p50 > 0.0 else 'ahead of'
-            clock = f'stamps are {abs(p50):.0f} s {way} the clock of this computer: one is off'
+            return AgeReport(values, slow, clock)
+        if clock:
             return AgeReport(values, clock=clock)
         if limit < p50 <= LONGEST_DELAY:
             slow = f'estimates are {p50:.1f} s old, because their messages arrive that late'

@@ -27,7 +27,7 @@ USUAL_NAMES = {
         'detection_timestamp_utc datecollectedutc date_collected_utc basedatetime '
         'base_date_time gps_time datenum matlab_time excel_time mjd jd julian_date elapsed '
         'elapsed_time zeit zeitstempel zeitpunkt '
-        'uhrzeit datum_zeit datum_uhrzeit horodatage date_heure heure temps fecha_hora '
+        'uhrzeit datum_zeit datum_uhrzeit horodatage date_heure heure temps tempo fecha_hora '
         'fecha_y_hora hora tiempo data_hora data_e_hora tidspunkt tidsstempel klokkeslett tid'
     ),
     'date': 'utc_date gps_date date_utc day datum fecha dato data',
@@ -83,9 +83,9 @@ USUAL_NAMES = {
         'precision desviacion_estandar desvio_padrao precisao noyaktighet standardavvik'
     ),
     'range': (
-        'distance dist entfernung distanz abstand distancia avstand slant_range slant_distance '
-        'schraegentfernung schraegdistanz distance_oblique distancia_inclinada skraavstand '
-        'horizontal_range horizontal_distance ground_range'
+        'distance dist rng alcance entfernung distanz abstand distancia avstand slant_range '
+        'slant_distance schraegentfernung schraegdistanz distance_oblique distancia_inclinada '
+        'skraavstand horizontal_range horizontal_distance ground_range'
     ),
     'std_range': 'sigma_range range_std',
     'forward': 'ahead fwd rel_forward voraus vorwaerts avant adelante frente forover foran forut',
@@ -100,7 +100,7 @@ USUAL_NAMES = {
     'vessel_longitude_minutes': '',
     'vessel_latitude_seconds': '',
     'vessel_longitude_seconds': '',
-    'heading': 'hdg gyro true_heading heading_true steuerkurs cap cap_vrai',
+    'heading': 'hdg gyro true_heading heading_true steuerkurs cap cap_vrai rumbo rumo proa',
     'roll': 'roll_angle rollen roulis balanceo',
     'pitch': 'pitch_angle stampfen tangage cabeceo',
     'vx': 'v_east ve vel_x velocity_x',
@@ -115,7 +115,8 @@ USUAL_NAMES = {
     'status': 'fix_status position_status zustand etat statut estado',
     'tag': (
         'tag_id transmitter transmitter_id tx tx_id full_id tagname tag_name '
-        'acoustic_tag_id signal'
+        'acoustic_tag_id signal sender sender_id sendernummer emetteur transmisor transmissor '
+        'marca marque merke'
     ),
     'code_space': 'codespace transmitter_codespace tag_code_space',
     'ping': 'ping_id ping_number',
@@ -131,7 +132,8 @@ USUAL_NAMES = {
     'std_toa': 'sigma_toa std_arrival sigma_arrival',
     'bearing': (
         'azimuth doa brg peilung azimut gisement relevement demora marcacion marcacao '
-        'peiling seitenpeilung true_bearing bearing_true relative_bearing bearing_relative'
+        'azimute peiling seitenpeilung true_bearing bearing_true relative_bearing '
+        'bearing_relative rel_bearing bearing_rel'
     ),
     'amplitude': 'amp response value',
     'var_bearing': '',
@@ -173,7 +175,7 @@ UNRELATED = (
 ).split()
 """Names of columns of numbers that are neither positions nor headings."""
 
-FROM_NORTH = {'azimuth', 'azimut', 'relevement', 'demora', 'true', 'north'}
+FROM_NORTH = {'azimuth', 'azimut', 'azimute', 'relevement', 'demora', 'true', 'north'}
 FROM_BOW = {'gisement', 'marcacao', 'relative', 'rel', 'bow', 'seitenpeilung'}
 """Words of headers of bearings that usually count from north and from the bow."""
 
@@ -329,6 +331,11 @@ def factor_of(name: str, header: str) -> float:
 def quantities_of(header: str) -> list[str]:
     """Return the quantities that a header may stand for."""
     return [name for name in ALIASES if rank_of(name, header) < len(_NAMES)]
+
+
+def is_of_vessel(header: str) -> bool:
+    """Return whether a header is that of a heading, or has a word for a vessel."""
+    return bool({'heading', *VESSELS} & {*quantities_of(header), *plain(header).split('_')})
 
 
 def rank_of(quantity: str, header: str) -> int:

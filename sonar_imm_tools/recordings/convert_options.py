@@ -180,6 +180,8 @@ class NmeaOptions(_WithTruth):
 
     EXAMPLES: ClassVar = ('harbour.nmea harbour.bag', 'gps.log buoy.bag --date 2024-05-31')
     date: str = option('', 'DATE', 'Date of the first line (UTC), where no sentence says it.')
+    time_zone: str = option('', 'ZONE',
+        'Zone of times before the sentences that do not say it; UTC by default.')
     own: str = option('auto', '',
         'What the positions of the receiver itself are; auto: of the vessel, where there are '
         'targets, else the fixes.', choices=('auto', 'vessel', 'fixes'))

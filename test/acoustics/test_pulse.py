@@ -52,6 +52,7 @@ def test_a_measured_pulse_is_even_and_scaled():
     assert pulse(np.array([0.0, 0.1, -0.1, 0.15, 3.0])) == pytest.approx(
         [1.0, 0.5, 0.5, 0.25, 0.0]
     )
+    assert measured_pulse([0.0, 1.0], [1.0, 0.0])(0.25) == pytest.approx(0.75)
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,7 @@ def test_a_frame_is_a_name_and_then_the_frame_is_the_map():
 
 def test_what_a_message_says_itself_stays():
     assert label('/bob/fix', fix(target_id=40), tags=['bob']).target_id == 40
+    assert label('/fix', fix('bob', target_id=40), tags=['bob']).frame_id == 'bob'
 
 
 def test_sensors_are_labelled_and_scans_are_no_tags():

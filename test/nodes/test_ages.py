@@ -16,6 +16,7 @@ from helpers.rig import a_fix, Rig
 import pytest
 
 from sonar_imm.nodes import base
+from sonar_imm.nodes.ages import Ages
 from sonar_imm.nodes.diagnostics import RISE
 from sonar_imm.nodes.qos import output_qos
 
@@ -66,3 +67,21 @@ def test_a_clock_that_is_an_hour_off_is_said_as_a_clock(told, age, way):
     assert status.message == f'stamps are 3600 s {way} the clock of this computer: one is off'
     values = {pair.key: pair.value for pair in status.values}
     assert float(values['age of estimates p50 [s]']) == pytest.approx(age, abs=30.0)
+
+
+@pytest.mark.parametrize(
+    ('age', 'wait', 'said'),
+    [
+        (3602.0, 2.0, ('estimates are 2.0 s old', 'stamps are 3600 s behind')),
+        (-3598.0, 2.0, ('estimates are 2.0 s old', 'stamps are 3600 s ahead of')),
+        (100.0, 100.0, ('estimates are 100.0 s old', '')),
+        (3600.0, 0.0, ('', 'stamps are 3600 s behind')),
+        (0.2, 0.1, ('', '')),
+    ],
+)
+def test_what_waits_in_the_node_is_no_clock_and_hides_none(age, wait, said):
+    ages = Ages()
+    for k in range(12):
+        ages.published(0.1 * k, age, wait)
+    report = ages.report(1.2)
+    assert (report.slow.partition(':')[0], report.clock.partition(' the clock')[0]) == said

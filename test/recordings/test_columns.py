@@ -65,6 +65,10 @@ def converted(folder, text, kind, *options):
         ('Latitude_deg;lon [deg]', 'latitude longitude'),
         ('GPS Lat;GPS Long', 'latitude longitude'),
         ('lat_dd;lon_dd', 'latitude longitude'),
+        ('Zeitstempel;Empfänger;Sender-ID', 'stamp receiver tag'),
+        ('Fecha y hora;Receptor;Transmisor', 'stamp receiver tag'),
+        ('Tempo;Alcance;Azimute;Rumo', 'stamp range bearing heading'),
+        ('Time;Rng (NM);rel_bearing;Rumbo buque', 'stamp range bearing heading'),
     ],
 )
 def test_headers_in_six_languages(table, headers, found):
@@ -259,6 +263,8 @@ def test_words_for_bad_rows(table, header, words, kept):
     [
         ('time;range;bearing_deg;Kurs [°]', '{k};50;{k}0;{c}', 'Kurs'),
         ('time;range;bearing_deg;heading', '{k};50;{k}0;{c}', 'heading'),
+        ('time;range;bearing_deg;Rumbo buque', '{k};50;{k}0;{k}', 'Rumbo buque'),
+        ('time;range;bearing_deg;ship speed', '{k};50;{k}0;3', 'ship speed'),
         ('time;range;bearing_deg;pos1;pos2', '{k};50;{k}0;59.4{c};10.4{c}', 'pos1, pos2'),
         ('time;range;bearing_deg;SNR [dB];no', '{k};50;{k}0;{c};{k}', ''),
         ('time;range;bearing_deg;note;port', '{k};50;{k}0;a{k};7', ''),

@@ -24,7 +24,7 @@ from sonar_imm.intake import RepeatFilter
 from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 
 from ... import SECOND
-from ..columns import name_of, rank_of, UNRELATED
+from ..columns import is_of_vessel, name_of, rank_of, UNRELATED
 from ..conversion import ask_for_units, ConversionReport, converter, Record, write_bag
 from ..convert_options import FixesOptions
 from ..messages import ros_message
@@ -189,7 +189,8 @@ def _ask_for_vessel(table: Table) -> None:
     left = [
         header
         for k, header in enumerate(table.headers)
-        if k not in used and name_of(header) not in UNRELATED and table.varies(k)
+        if k not in used
+        and (is_of_vessel(header) or name_of(header) not in UNRELATED and table.varies(k))
     ]
     if left:
         raise BagError(

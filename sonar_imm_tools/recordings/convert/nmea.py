@@ -68,6 +68,8 @@ OTHER_USBL = ('PSIMLBP', 'PTSAG', 'PTSAX')
 """Sentences of targets that are not read."""
 OWN = re.compile(r'\$([A-Z]{2})(?:GGA|RMC|GLL|GNS),')
 """A sentence with the position of the receiver itself, and its talker."""
+FARTHEST_CLOCK = 600.0
+"""Seconds between the clock of a logger and that of a receiver in one zone."""
 APART = 20.0
 """Metres between what is said of one moment from which on it is of two receivers; two decimals of
 a minute are 18 m."""
@@ -100,6 +102,20 @@ class _Log:
     """Metres between two positions of one moment."""
     seen: tuple[VesselFix, str, str] | None = None
     """The first position of the last moment, its talker and its kind of sentence."""
+    no_zone: int = 0
+    """How many times before a sentence name no zone."""
+    ahead: list[float] = Factory(list)
+    """Seconds from the time in a sentence, UTC, to that before it; of the nearest day."""
+
+    def zone(self, stated: str) -> str:
+        """Return the zone of times before a sentence that name none: `stated`, else UTC."""
+        self.no_zone += not stated
+        return stated or 'UTC'
+
+    def compare(self, stamp_ns: int, clock: Time) -> None:
+        """Compare the time before a sentence with that in it."""
+        own = 3600 * clock.hour + 60 * clock.minute + clock.second
+        self.ahead.append((stamp_ns / SECOND - own + 43200.0) % 86400.0 - 43200.0)
 
 
 @converter(NmeaOptions)
@@ -122,6 +138,7 @@ def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None
         for heading in log.headings
     ]
     _tell_receivers(log, path, report, how.talker)
+    _tell_zone(log, path, report)
     leaps = Leaps()
     leaps.saw_all(log.own)
     leaps.tell(path, report)
@@ -167,6 +184,24 @@ def _tell_receivers(log: _Log, path: Path, report: ConversionReport, chosen: str
         )
 
 
+def _tell_zone(log: _Log, path: Path, report: ConversionReport) -> None:
+    """Say that times before sentences name no zone. Raises `BagError` where those in the sentences
+    are others."""
+    if not log.no_zone:
+        return
+    ahead = float(np.median(log.ahead)) if log.ahead else 0.0
+    if abs(ahead) > FARTHEST_CLOCK:
+        raise BagError(
+            f'{path}: the times before the sentences name no zone and are {ahead / 3600.0:+.2g} h '
+            'from those in the sentences (UTC); say --time-zone, e.g. --time-zone +02:00 or UTC'
+        )
+    if not log.ahead:
+        report.questions.append(
+            f'{path.name}: the times before the sentences name no zone and are taken for UTC; is '
+            '--time-zone +02:00 or another one meant?'
+        )
+
+
 def _talkers(path: Path) -> Counter[str]:
     """How many sentences each talker says of the place of the receiver."""
     found = (OWN.search(line) for _, line in _lines(path))
@@ -198,7 +233,7 @@ def _read(path: Path, report: ConversionReport, how: NmeaOptions) -> _Log:
             continue
         report.rows += 1
         try:
-            stamp = _stamp(found['before'])
+            stamp = _stamp(found['before'], lambda: log.zone(how.time_zone))
             sentence = found['sentence']
             head = sentence[1:].partition(',')[0]
             if head in USBL:
@@ -246,15 +281,16 @@ def _day(text: str) -> Date | None:
         raise BagError(f"'{text}' is no date; write 2024-05-31") from None
 
 
-def _stamp(before: str) -> int | None:
-    """The time that stands before a sentence, ns since 1970. Raises `BadRow`."""
+def _stamp(before: str, zone: Callable[[], str]) -> int | None:
+    """The time that stands before a sentence, ns since 1970, in `zone` where it names none.
+    Raises `BadRow`."""
     if block := _TAG_BLOCK.search(before):
         number = int(block.group(1))
         return number * (10**6 if number > 10**11 else SECOND)
     text = before.split('\\')[0].strip(' \t,;[]')
     if not text:
         return None
-    if (stamp_ns := moment_ns(text, lambda: 'UTC')) is not None:
+    if (stamp_ns := moment_ns(text, zone)) is not None:
         return stamp_ns
     if re.fullmatch(r'\d{9,10}(\.\d+)?', text):
         return round(float(text) * 1e6) * 1000
@@ -273,6 +309,8 @@ def _take(log: _Log, sentence: Any, stamp: int | None) -> None:
     clock = getattr(sentence, 'timestamp', None)
     if stamp is not None:
         log.clock = stamp
+        if clock and kind not in ('GST', 'TLL', 'TTM'):
+            log.compare(stamp, clock)
     elif clock and kind != 'GST':
         if not _CLOCK.match(str(sentence.data[sentence.name_to_idx['timestamp']])):
             raise BadRow('has a time that cannot be read as HHMMSS', 'unreadable time')
@@ -285,9 +323,11 @@ def _take(log: _Log, sentence: Any, stamp: int | None) -> None:
         stds = [float(std) for std in (sentence.std_dev_latitude, sentence.std_dev_longitude)]
         log.std = max(stds)
     elif kind == 'TLL':
+        log.hears = True
         row = _row(_now(log), sentence.latitude, sentence.longitude)
         log.targets.append(row | {'id': str(sentence.target_name or sentence.target_number)})
     elif kind == 'TTM':
+        log.hears = True
         _take_tracked(log, sentence)
     elif day is None:
         log.unread[kind] += 1
@@ -454,7 +494,7 @@ def _take_usbl(
         raise BadRow('is flagged as invalid', 'flagged invalid')
     if (system, orientation) != ('C', 'H'):
         raise BadRow(
-            f'has the coordinates {system}, {orientation}; C, H (metres ahead and to starboard) '
+            f'has the coordinates {system}, {orientation}; C, H (metres to starboard and ahead) '
             'are read',
             'other coordinates',
         )

@@ -84,7 +84,7 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
         left = [
             header
             for k, header in enumerate(table.headers)
-            if k not in table.index.values() and table.varies(k)
+            if k not in table.index.values() and table.first_numbers(k, 1.0)
         ]
         raise BagError(
             f'{table.path} has no column for heading, and bearings count from the bow; not used '

@@ -102,7 +102,7 @@ class ShipScenario(Scenario):
         for name, wanted in (('sonar_lever', 3), ('sonar_mount_rpy_deg', 3)):
             if len(getattr(self, name)) != wanted:
                 problems.append(f'{name} needs {wanted} values, got {len(getattr(self, name))}')
-        if len(self.patch_along) not in (0, 2) or any(np.diff(self.patch_along) < 0.0):
+        if len(self.patch_along) not in (0, 2) or any(np.diff(self.patch_along) <= 0.0):
             problems.append('patch_along needs two increasing values, or none')
         return problems
 

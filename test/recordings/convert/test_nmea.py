@@ -366,3 +366,39 @@ def test_headings_that_say_that_there_is_none_are_left_out(tmp_path, body):
     lines.append(ais(211, PLACE, 51))
     report = converted(tmp_path, lines)
     assert report.messages['/heading'] == 1 and report.bad_rows == 1
+
+
+@pytest.mark.parametrize('hours', [0, 2, -9])
+def test_times_before_sentences_of_another_zone_are_asked_about(tmp_path, hours):
+    moments = [BEGIN + timedelta(seconds=k) for k in range(5)]
+    lines = [
+        f'{moment + timedelta(hours=hours):%Y-%m-%d %H:%M:%S} {position("RMC", moment)}'
+        for moment in moments
+    ]
+    if hours:
+        with pytest.raises(BagError, match=rf'are [+]?{hours} h from .* --time-zone'):
+            converted(tmp_path, lines)
+    report = converted(tmp_path, lines, time_zone=f'{hours:+03d}:00' if hours else '')
+    with BagReader(report.path) as bag:
+        stamps = [item.log_ns / 1e9 for item in bag.messages(['/fix'])]
+    assert stamps == [moment.timestamp() for moment in moments] and not report.questions
+    # Of AIS alone nobody says the time of day.
+    lines = [f'2024-05-31 10:00:{k:02d} {ais(7, PLACE, 60)}' for k in range(5)]
+    shutil.rmtree(report.path)
+    assert '--time-zone' in converted(tmp_path, lines).questions[0]
+
+
+def test_a_radar_without_heading_makes_the_vessel_no_target(tmp_path):
+    target = ('01', '1.0', '45.0', 'R', '0', '0', 'T', '0', '0', 'N', 'A', 'T', '', '', 'A')
+    lines = [position('RMC', BEGIN), str(pynmea2.TTM('RA', 'TTM', target))]
+    with pytest.raises(BagError, match='no heading came before it'):
+        converted(tmp_path, lines)
+    assert converted(tmp_path, lines, own='fixes').messages == {'/fix': 1}
+
+
+def test_reports_of_the_own_ship_alone_are_named(tmp_path):
+    line = pyais.encode_dict(
+        {'type': 1, 'mmsi': 7, 'lat': 54.0, 'lon': 10.0, 'second': 60}, sentence_type='VDO'
+    )[0]
+    with pytest.raises(BagError, match='1 AIS reports of the own ship'):
+        converted(tmp_path, [f'1700000000 {line}'])

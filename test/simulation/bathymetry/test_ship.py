@@ -151,6 +151,7 @@ def test_the_sides_look_apart():
         ({'moving': True, 'sound_speed_profile': [0.0]}, 'in turn'),
         ({'sonar_lever': [1.0]}, 'sonar_lever needs 3'),
         ({'patch_along': [5.0, 1.0]}, 'patch_along'),
+        ({'patch_along': [5.0, 5.0]}, 'patch_along needs two increasing values'),
         ({'moving': True, 'multipath': True}, 'multipath'),
     ],
 )
