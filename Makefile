@@ -134,6 +134,7 @@ docs: generate $(DOCS_STAMP) ## the same, and build the pages of docs/ with the 
 	$(TEST_ENV) NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo 'Open site/index.html.'
 
+docs-version: export SITE_VERSIONS = 1
 docs-version: docs ## the same site in pages/VERSION, beside those of earlier versions
 	@$(BIN)/python .ci/versioned_site.py site pages "$$($(BIN)/python -c 'import sonar_imm; print(sonar_imm.__version__)')"
 

@@ -20,6 +20,7 @@ from collections.abc import Iterable
 import contextlib
 import io
 import json
+import os
 from pathlib import Path
 import re
 import tempfile
@@ -63,6 +64,14 @@ TYPICAL = """\
 Recordings in `bags/` are simulated. These are typical: of 31 seeds the one in the middle.
 `sonar-imm check` plays them to the live nodes and allows the error in the last column, which nine
 in ten of those seeds stay below."""
+
+
+def on_config(config: Any) -> Any:
+    """Called by mkdocs first: only a site among versions asks for their list, which a page that
+    is opened as a file may not."""
+    if 'SITE_VERSIONS' not in os.environ:
+        config.extra.pop('version', None)
+    return config
 
 
 def on_files(files: Any, config: Any) -> Any:

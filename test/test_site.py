@@ -16,6 +16,7 @@ from __future__ import annotations
 import importlib
 import re
 import sys
+from types import SimpleNamespace
 from typing import Any
 
 from helpers.source import ROOT
@@ -136,6 +137,14 @@ def test_links_to_notebooks_lead_to_their_pages(made: Any) -> None:
     text = '[a](../../examples/own_data.ipynb), [b](../runs.md)'
     shown = made.on_page_markdown(text, None, None, None)
     assert shown == '[a](../examples/own_data.md), [b](../runs.md)'
+
+
+def test_a_site_alone_asks_for_no_list_of_versions(made: Any, monkeypatch: Any) -> None:
+    config = SimpleNamespace(extra={'version': {'provider': 'mike'}})
+    monkeypatch.setenv('SITE_VERSIONS', '1')
+    assert 'version' in made.on_config(config).extra
+    monkeypatch.delenv('SITE_VERSIONS')
+    assert 'version' not in made.on_config(config).extra
 
 
 def test_what_comes_from_another_server_is_seen(made: Any) -> None:
