@@ -390,7 +390,7 @@ class RunFolder:
     def bins(self) -> Path | None:
         """The table of a run whose bag lacks the estimates; None where the bag has them."""
         table = self.path / PARQUET[CSV]
-        return table if 'soundings' in self.read_run() and table.exists() else None
+        return table if table.exists() and 'soundings' in self.read_run() else None
 
     def read_estimates(self) -> list[Estimate]:
         """The estimates of the run, as written. Raises `BagError` when its files are damaged, and

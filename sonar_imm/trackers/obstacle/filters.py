@@ -367,7 +367,8 @@ class BehaviourSlices(DepthSlices):
         known = (*SWITCHING, *self.own, 'seabed')
         self.behaviours = tuple(name for name in known if name in config.behaviours)
         switching = [name for name in self.behaviours if name != 'seabed']
-        for name in ('swaying', 'moving'):
+        moving = ('moving', *(name for name, own in self.own.items() if own.velocity))
+        for name in ('swaying', *moving):
             if name in switching:
                 switching.insert(switching.index(name) + 1, name)
         self.slices, self.M = config.components, len(switching)
@@ -380,7 +381,7 @@ class BehaviourSlices(DepthSlices):
             second[a : self.slices * self.M : self.M] = True
         sways = behaviour == 'swaying'
         self._sway = config.sway_std * np.where(second, WIDER, 1.0) * sways
-        self._begun = second & (behaviour == 'moving')
+        self._begun = second & np.isin(behaviour, moving)
         self._share = np.where(sways, np.where(second, WIDE_SHARE, 1.0 - WIDE_SHARE), 1.0)
         self._share[self._begun] = 0.0
         self._count, self._identity = round(self._share[: self.M].sum()), np.eye(self.M)
@@ -454,7 +455,7 @@ class BehaviourSlices(DepthSlices):
         share, N, begun = self._share[: self.M], self._count, self._begun[: self.M]
         rate = N / ((N - 1) * self.config.behaviour_time) if N > 1 else 0.0
         change = (1.0 - 1.0 / N) * -math.expm1(-rate * dt)
-        enters = np.where(self._is['moving'][: self.M], begun, share)
+        enters = np.where(self.moves[: self.M], begun, share)
         chain = np.where(
             self._same, self._identity * (1.0 - change), enters * change / max(N - 1, 1)
         )
