@@ -23,7 +23,8 @@ from ..estimation.arrays import FloatArray
 
 NEAR_ZERO = 1e-4
 """Degrees; both of a position below it are the place of receivers without a fix."""
-EARTH_RADIUS = 6.371e6
+EARTH_RADIUS = 6_371_008.8
+"""Metres, the mean."""
 EXACT = 1e-3
 """Metres to which a height is met."""
 MOST_STEPS = 8

@@ -332,6 +332,15 @@ def _ask_for_places(table: Table) -> None:
         )
 
 
+def speeds_of_degrees(seconds: FloatArray, places: FloatArray) -> FloatArray:
+    """Return the speeds (m,) of places (n, 2), of unknown unit, a second between stamps (n,) that
+    rise; none where not all places could be degrees, longitude first."""
+    if not (np.abs(places) <= (180.0, 90.0)).all():
+        return np.empty(0)
+    rising = np.diff(seconds) > 0.0
+    return np.hypot(*np.diff(places, axis=0)[rising].T) / np.diff(seconds)[rising]
+
+
 def _ask_for_degrees(table: Table) -> None:
     """Raise `BagError` where x and y without a unit move as longitude and latitude do."""
     if any(unit_of(table.with_unit(name)) or name in table.options.columns for name in 'xy'):
@@ -343,11 +352,9 @@ def _ask_for_degrees(table: Table) -> None:
     if len(rows) < LEAST_ROWS or not table.UNITS_ARE_FREE:
         return
     places = np.array(rows)
-    steps = np.diff(places, axis=0)
-    speed = np.hypot(*steps[steps[:, 0] > 0.0, 1:].T) / steps[steps[:, 0] > 0.0, 0]
-    moving = speed[speed > 0.0]
-    on_earth = (np.abs(places[:, 1:]) <= (180.0, 90.0)).all()
-    if on_earth and len(moving) >= LEAST_ROWS and np.median(moving) < SLOWEST:
+    speeds = speeds_of_degrees(places[:, 0], places[:, 1:])
+    moving = speeds[speeds > 0.0]
+    if len(moving) >= LEAST_ROWS and np.median(moving) < SLOWEST:
         x, y = table.header('x'), table.header('y')
         raise BagError(
             f'{table.path}: {x} and {y}, such as {places[0, 1]:.7g}, {places[0, 2]:.7g}, move by '

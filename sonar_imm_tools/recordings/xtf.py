@@ -25,6 +25,7 @@ import warnings
 import numpy as np
 
 from .conversion import ConversionReport
+from .places import speeds_of_degrees
 from .sources import BagError
 
 FILE_HEAD, PACKET_HEAD, LARGEST_PACKET = 1024, 14, 64 << 20  # bytes
@@ -54,20 +55,19 @@ def pings_in(path: Path, report: ConversionReport, units: str) -> Iterator[dict[
 def _doubted_unit(pings: list[dict[str, Any]]) -> str:
     """Say why the places of pings may be of another unit than the file says; empty if not."""
     unit, place = pings[0]['units'], np.array([ping['place'] for ping in pings], np.float64)
-    on_earth = (np.abs(place) <= (180.0, 90.0)).all(axis=1)
     such = f'such as {place[0, 0]:.7g}, {place[0, 1]:.7g}'
     if unit not in UNITS.values():
         return f'the file does not say the unit of its places, {such}'
     if unit == 'degrees':
+        on_earth = (np.abs(place) <= (180.0, 90.0)).all(axis=1)
         beyond = 2 * on_earth.sum() < len(place)
         return f'the file says that its places are degrees, and they are {such}' if beyond else ''
-    seconds = np.diff([ping['stamp_ns'] for ping in pings]) * 1e-9
-    steps = np.hypot(*np.diff(place, axis=0).T)[seconds > 0.0] / seconds[seconds > 0.0]
-    if not (on_earth.all() and len(steps) and 0.0 < np.median(steps) < SLOWEST):
+    speeds = speeds_of_degrees(np.array([ping['stamp_ns'] for ping in pings]) * 1e-9, place)
+    if not (len(speeds) and 0.0 < np.median(speeds) < SLOWEST):
         return ''
     return (
         f'the file says that its places are metres; they are {such} and move by '
-        f'{np.median(steps):.2g} a second, as degrees do'
+        f'{np.median(speeds):.2g} a second, as degrees do'
     )
 
 

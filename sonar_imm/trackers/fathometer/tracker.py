@@ -459,18 +459,19 @@ class FathometerTracker:
         tables = self._lattice.cells * (2.0 * reach + 1.0)
         return records == 1 or (records <= LONGEST_GAP and tables <= MAX_MOVES)
 
-    def _named(self, reflectors: Reflectors, records: int) -> tuple[Identities, IdArray]:
-        known = self._ids.wait(records - 1) if records <= LONGEST_GAP else self._ids.forget()
+    def _named(
+        self, known: Identities, found: Reflectors, records: int
+    ) -> tuple[Identities, IdArray]:
+        known = known.wait(records - 1) if records <= LONGEST_GAP else known.forget()
         # Where heave begins to be a state, all depths may come to lie elsewhere together.
-        most = 2.0 * self._own.common_jump_std if reflectors.heave_std else 0.0
-        within = self._own.min_separation
-        jump = reflectors.probable_jump or known.offset(reflectors.depth, most, within)
+        most = 2.0 * self._own.common_jump_std if found.heave_std else 0.0
+        jump = found.probable_jump or known.offset(found.depth, most, self._own.min_separation)
         return known.moved(jump).name(
-            reflectors.depth,
-            reflectors.is_bottom,
+            found.depth,
+            found.is_bottom,
             self._own,
-            reflectors.covariance[:, 0, 0],
-            strength=reflectors.strength,
+            found.covariance[:, 0, 0],
+            strength=found.strength,
             floor_known=bool(self._water.active),
             jump=jump,
         )
@@ -486,14 +487,13 @@ class FathometerTracker:
         self.counts['unexplained'] += not step.ok
         reflectors, pmf = self._summarise(step, response)
         before = self._ids
-        self._ids, ids = self._named(reflectors, records)
+        self._ids, ids = self._named(before, reflectors, records)
         if records == 1:
-            array = not self._water.active
-            self._datum.note(before, ids, reflectors, self._own, array=array)
+            self._datum.note(before, ids, reflectors, self._own, array=not self._water.active)
         if again := self._datum_followed(response):
             response, step = again
             reflectors, pmf = self._summarise(step, response)
-            self._ids, ids = self._named(reflectors, 1)
+            self._ids, ids = self._named(before, reflectors, records)
             self._datum.heave = reflectors.heave
         self._taken.append(Taken(response, self._ids.reflectors, reflectors.probable_jump))
         self._health.update(
@@ -551,7 +551,7 @@ class FathometerTracker:
     def _preview(self, response: Response) -> Estimate:
         response, step, records, _ = self._filtered(response)
         reflectors, pmf = self._summarise(step, response)
-        known, ids = self._named(reflectors, records)
+        known, ids = self._named(self._ids, reflectors, records)
         self.counts['previews'] += 1
         return self._write(reflectors, ids, pmf, response, known, records, preview=True)
 

@@ -37,12 +37,12 @@ from attrs import evolve
 import numpy as np
 import plotly.graph_objects as go
 
+from sonar_imm.acoustics.geodesy import EARTH_RADIUS
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 from ...offline.run_folder import read_measurements, RunFolder
-from ...recordings.export.horizons import EARTH_RADIUS
 from ...recordings.positions import read_positions
 from ...recordings.reader import BagReader
 from ...recordings.sources import BagError

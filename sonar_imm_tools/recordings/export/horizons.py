@@ -33,6 +33,7 @@ from typing import Any
 from attrs import frozen
 import numpy as np
 
+from sonar_imm.acoustics.geodesy import EARTH_RADIUS
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
@@ -43,7 +44,6 @@ from ..segy_lines import opened_for_change, READ_OPTIONS, read_segy, SegyLine
 from ..sources import BagError
 from .points import wkt_of
 
-EARTH_RADIUS = 6_371_008.8
 _COPIED = ('existence', 'is_bottom', 'multiple_probability')
 
 
