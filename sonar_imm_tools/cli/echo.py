@@ -77,11 +77,11 @@ def command(
             listener = TableListener(link, topics)
             announced: list[str] = []
             for table in listener.tables(timeout):
+                # With the first table, or a look after it subscribed: publishers know of it by then.
+                if listener.topics != announced and not sys.stdout.isatty():
+                    announced = listener.topics
+                    warn(f'listening to {", ".join(announced)}')
                 if table is None:
-                    # A look after it subscribed, so that publishers know of it by then.
-                    if listener.topics != announced and not sys.stdout.isatty():
-                        announced = listener.topics
-                        warn(f'listening to {", ".join(announced)}')
                     continue
                 show(table)
                 if left is not None and (left := left - 1) == 0:
