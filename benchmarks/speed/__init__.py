@@ -24,6 +24,8 @@ from typing import Any
 
 from attrs import frozen
 
+from sonar_imm_tools.evaluation.numbers import flatten
+
 PEERS = ('filterpy', 'stonesoup')
 """Libraries that a bench may need to compare with."""
 
@@ -34,12 +36,20 @@ class Bench:
 
     name: its key in the JSON. measure: takes the number of rounds, for what is measured in turn
     with another program, and gives plain numbers, with ``good`` where there is a goal; raises
-    ModuleNotFoundError when that program is not installed. sentence: the numbers for people.
+    ModuleNotFoundError when that program is not installed.
     """
 
     name: str
     measure: Callable[[int], dict[str, Any]]
-    sentence: Callable[[dict[str, Any]], str]
+
+
+def sentence(bench: Bench, result: dict[str, Any]) -> str:
+    """The numbers of a bench in one line."""
+    numbers = (
+        f'{name} {value:.4g}' if isinstance(value, float) else f'{name} {value}'
+        for name, value in flatten(result).items()
+    )
+    return f'{bench.name}: {", ".join(numbers)}'
 
 
 def seconds_of(function: Callable[..., Any], *arguments: Any) -> float:
