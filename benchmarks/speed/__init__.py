@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Speed: what ``sonar-imm bench`` measures, beside FilterPy and Stone Soup in the same run.
+"""Speed: what ``sonar-imm bench`` measures, beside other programs in the same run.
 
     sonar-imm bench diver --rounds 5
 
@@ -26,7 +26,7 @@ from attrs import frozen
 
 from sonar_imm_tools.evaluation.numbers import flatten
 
-PEERS = ('filterpy', 'stonesoup')
+PEERS = ('filterpy',)
 """Libraries that a bench may need to compare with."""
 
 

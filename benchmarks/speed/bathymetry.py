@@ -6,22 +6,18 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""How fast the bathymetry tracker is, against other filters on the same pings in the same run.
+"""How fast the bathymetry tracker is, against the same filter in plain numpy on the same pings.
 
-All filters take the complex64 snapshots of the paper's scene and are timed in turn, round after
-round. The best round counts, because it is the least disturbed one. Of the tracker the whole of
-`process` is timed: variances, filter and estimate.
-
-`numpy_filter` is the IMM particle filter in plain numpy: all particles of a model at once, one bin
-after the other. `stone_soup_filter` is the multi-model particle filter of Stone Soup, another
-algorithm (one set of particles that carry their model) with the same likelihood and as many
-particles in all. Both suppose the scene of the paper, two random walks and noise of unit variance.
+Both take the complex64 snapshots of the paper's scene and are timed in turn, round after round.
+The best round counts, because it is the least disturbed one. Of the tracker the whole of `process`
+is timed: variances, filter and estimate. `numpy_filter` runs all particles of a model at once, one
+bin after the other; it supposes the scene of the paper, two random walks and noise of unit
+variance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from datetime import datetime, timedelta
 import math
 from typing import Any
 
@@ -106,62 +102,6 @@ def numpy_filter(ping: Snapshot, particles: int = 100, seed: int = 0) -> FloatAr
     return mean
 
 
-def stone_soup_filter(ping: Snapshot, particles: int = 200) -> FloatArray:
-    """Mean height (T,) by Stone Soup's multi-model particle filter. Raises ModuleNotFoundError."""
-    from stonesoup.base import Property
-    from stonesoup.models.measurement.base import MeasurementModel
-    from stonesoup.models.transition.linear import RandomWalk
-    from stonesoup.predictor.particle import MultiModelPredictor
-    from stonesoup.resampler.particle import SystematicResampler
-    from stonesoup.types.array import StateVectors
-    from stonesoup.types.detection import Detection
-    from stonesoup.types.hypothesis import SingleHypothesis
-    from stonesoup.types.state import MultiModelParticleState
-    from stonesoup.updater.particle import MultiModelParticleUpdater
-
-    class Likelihood(MeasurementModel):
-        """A detection is the number of its bin; the likelihood has the samples."""
-
-        likelihood: NumpyLikelihood = Property()
-        ndim_meas = 1
-
-        def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
-            raise NotImplementedError
-
-        def rvs(self, num_samples: int = 1, **kwargs: Any) -> Any:
-            raise NotImplementedError
-
-        def pdf(self, state1: Any, state2: Any, **kwargs: Any) -> Any:
-            return np.exp(self.logpdf(state1, state2))
-
-        def logpdf(self, state1: Any, state2: Any, **kwargs: Any) -> FloatArray:
-            heights = np.asarray(state2.state_vector[0, :], np.float64)
-            return self.likelihood.log_likelihood(int(state1.state_vector[0, 0]), heights)
-
-    # Stone Soup scales the variance with the time step, which is one second here.
-    predictor = MultiModelPredictor([RandomWalk(sigma**2) for sigma in SIGMAS], CHAIN, [[0], [0]])
-    model = Likelihood(ndim_state=1, mapping=(0,), likelihood=NumpyLikelihood(ping))
-    updater = MultiModelParticleUpdater(model, predictor, SystematicResampler())
-    np.random.seed(0)
-    start = datetime(2026, 1, 1)
-    state = MultiModelParticleState(
-        StateVectors(np.random.normal(size=(1, particles))),
-        weight=np.full(particles, 1.0 / particles),
-        dynamic_model=np.random.randint(0, 2, particles),
-        timestamp=start,
-    )
-    mean = np.empty(len(ping))
-    for t in range(len(ping)):
-        stamp = start + timedelta(seconds=t + 1)
-        prediction = predictor.predict(state, timestamp=stamp)
-        detection = Detection([t], timestamp=stamp)
-        state = updater.update(SingleHypothesis(prediction, detection))
-        mean[t] = float(np.mean(state.state_vector[0, :]))
-        state.hypothesis = None
-        state.parent = None
-    return mean
-
-
 def cut(ping: Snapshot, bins: int) -> Snapshot:
     """The first `bins` bins of a ping."""
     return Snapshot(
@@ -223,17 +163,9 @@ def bench_numpy(rounds: int = 7) -> dict[str, Any]:
     }
 
 
-def bench_stone_soup(rounds: int = 7) -> dict[str, Any]:
-    """Bins per second of the tracker and of Stone Soup. Raises ModuleNotFoundError without it."""
-    short = cut(a_ping(), PEER_BINS)
-    peer: Timed = (lambda: stone_soup_filter(short), PEER_BINS)
-    speed = rates({'particles': engines(short)['particles'], 'stone_soup': peer}, min(rounds, 3))
-    return {'bins_per_second': speed, 'ratio': speed['particles'] / speed['stone_soup']}
-
-
 def _heights(ping: Snapshot) -> np.ndarray:
     tracker = BathymetryTracker(config(gate_false_alarm=1.0))
     return tracker.process(ping)[0].state[:, 0]
 
 
-BENCHES = Bench('numpy', bench_numpy), Bench('stone_soup', bench_stone_soup)
+BENCHES = (Bench('numpy', bench_numpy),)

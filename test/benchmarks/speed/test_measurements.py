@@ -41,14 +41,6 @@ def test_the_best_round_of_each_method_counts(monkeypatch):
     assert bathymetry.rates(methods, rounds=3) == {'a': 5.0, 'b': 0.5}
 
 
-def test_stone_soup_follows_the_same_floor(short):
-    pytest.importorskip('stonesoup')
-    height = bathymetry.stone_soup_filter(bathymetry.cut(short, 60))
-    assert abs(height[20:]).max() < 0.5
-    speeds = bathymetry.bench_stone_soup(rounds=1)['bins_per_second']
-    assert set(speeds) == {'particles', 'stone_soup'}
-
-
 def test_filterpy_does_the_same_sums_for_a_diver():
     pytest.importorskip('filterpy')
     assert diver.bench_step(rounds=1, steps=8)['largest_difference_m'] < 1e-9
