@@ -48,6 +48,8 @@ def one_spoilt(values):
 @pytest.mark.parametrize('kind', WHOLE)
 def test_a_single_number_that_is_not_finite_is_refused(kind):
     assert kind(stamp_ns=1, **WHOLE[kind]).stamp_ns == 1
+    with pytest.raises(Rejection, match='the header stamp is 0 ns'):
+        kind(stamp_ns=0, **WHOLE[kind])
     # A z that is not measured may be NaN.
     asked = [each for each in one_spoilt(WHOLE[kind]) if not _is_depth(kind, each)]
     assert len(asked) >= 4
