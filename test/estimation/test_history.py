@@ -64,10 +64,10 @@ def bounded_shuffles(draw):
     return window, [(stamp, key) for stamp, key, _, _ in sent]
 
 
-@given(bounded_shuffles())
-def test_shuffled_inside_the_window_equals_sorted(case):
+@given(bounded_shuffles(), st.sampled_from([None, 4, 5, 9]))
+def test_shuffled_inside_the_window_equals_sorted(case, state_limit):
     window, arrivals = case
-    final, verdicts = run(ReplayHistory(b'', window), arrivals)
+    final, verdicts = run(ReplayHistory(b'', window, state_limit=state_limit), arrivals)
     assert final == sorted_truth(arrivals)
     assert verdicts.count('used') == len(set(arrivals))
     assert verdicts.count('duplicate') == len(arrivals) - len(set(arrivals))
@@ -80,6 +80,19 @@ def test_memory_is_bounded_by_the_window(case):
     for stamp_ns, key in arrivals:
         history.insert(stamp_ns, key, key, chain)
         assert len(history) <= window + 1
+
+
+@given(st.lists(st.integers(0, 400), max_size=150), st.sampled_from([4, 7, 16]))
+def test_states_are_bounded_and_any_order_gives_the_same(stamps, limit):
+    """Late ones far back need a state that is not kept."""
+    few, all_states = ReplayHistory(b'', 300, state_limit=limit), ReplayHistory(b'', 300)
+    for stamp_ns in [*range(0, 200, 3), *stamps]:
+        key = bytes([stamp_ns % 251])
+        assert few.insert(stamp_ns, key, key, chain) == all_states.insert(
+            stamp_ns, key, key, chain
+        )
+        assert limit // 2 < len(few.states) <= limit or len(few) <= limit
+    assert few.state == all_states.state and len(few) >= len(all_states)
 
 
 @given(
@@ -146,9 +159,12 @@ def test_a_step_that_raises_leaves_the_history_as_it_was():
     )
 
 
-@pytest.mark.parametrize('arguments', [{'window_ns': -1}, {'window_ns': 0, 'scan_limit': 0}])
+@pytest.mark.parametrize(
+    'arguments',
+    [{'window_ns': -1}, {'window_ns': 0, 'scan_limit': 0}, {'window_ns': 0, 'state_limit': 3}],
+)
 def test_history_refuses_nonsense(arguments):
-    with pytest.raises(ValueError, match='window_ns >= 0'):
+    with pytest.raises(ValueError, match='a history needs'):
         ReplayHistory(b'', **arguments)
 
 
