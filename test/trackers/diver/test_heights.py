@@ -12,7 +12,6 @@ a track that are spread over depth."""
 import math
 
 from helpers.diver_runs import arrivals
-from helpers.diver_runs import arrivals
 import numpy as np
 import pytest
 
