@@ -302,7 +302,7 @@ def test_ospa_by_hand():
     assert ospa(NOTHING, POINTS, cutoff=4.0) == 4.0
 
 
-def brute_force(truth, estimate, c, p):
+def over_matchings(truth, estimate, c, p):
     """GOSPA and OSPA over all partial matchings, by definition."""
     both, most = len(truth) + len(estimate), max(len(truth), len(estimate))
     sums = []
@@ -325,7 +325,7 @@ SETS = (
 @given(SETS, st.sampled_from([1.0, 2.0]))
 def test_both_are_the_least_over_all_matchings(sets, p):
     found = gospa(*sets, 2.0, p).distance, ospa(*sets, 2.0, p)
-    assert found == pytest.approx(brute_force(*sets, 2.0, p), abs=1e-9)
+    assert found == pytest.approx(over_matchings(*sets, 2.0, p), abs=1e-9)
 
 
 @given(SETS)

@@ -32,7 +32,7 @@ def run(history, arrivals, step=chain):
         inserted = history.insert(stamp_ns, key, key, step)
         final.update(inserted.revised)
         verdicts.append(inserted.verdict)
-        assert len(history) <= history.window_ns + 1
+        assert len(history) <= history.window_ns + 1 or history.state_limit
     return final, verdicts
 
 
@@ -55,13 +55,25 @@ def bounded_shuffles(draw):
     return window, [(stamp, bytes([key])) for stamp, key, _, _ in sent]
 
 
-@given(bounded_shuffles())
-def test_shuffled_inside_the_window_equals_sorted(case):
+@given(bounded_shuffles(), st.sampled_from([None, 4, 5, 9]))
+def test_shuffled_inside_the_window_equals_sorted(case, state_limit):
     window, arrivals = case
-    final, verdicts = run(ReplayHistory(b'', window), arrivals)
+    final, verdicts = run(ReplayHistory(b'', window, state_limit=state_limit), arrivals)
     assert final == sorted_truth(arrivals)
     assert verdicts.count('used') == len(set(arrivals))
     assert verdicts.count('duplicate') == len(arrivals) - len(set(arrivals))
+
+
+@given(st.lists(st.integers(0, 400), max_size=150), st.sampled_from([4, 7, 16]))
+def test_states_are_bounded_and_any_order_gives_the_same(stamps, limit):
+    """Late ones far back need a state that is not kept."""
+    few, all_states = ReplayHistory(b'', 300, state_limit=limit), ReplayHistory(b'', 300)
+    for stamp_ns in [*range(0, 200, 3), *stamps]:
+        key = bytes([stamp_ns % 251])
+        item = stamp_ns, key, key, chain
+        assert few.insert(*item) == all_states.insert(*item)
+        assert limit // 2 < len(few.states) <= limit or len(few) <= limit
+    assert few.state == all_states.state and len(few) >= len(all_states)
 
 
 @given(
@@ -291,8 +303,10 @@ def test_every_item_has_exactly_one_fate(stamps, window, gap, hold):
 @pytest.mark.parametrize(
     'kind, arguments, problem',
     [
-        (ReplayHistory, {'initial': b'', 'window_ns': -1}, 'window_ns >= 0'),
-        (ReplayHistory, {'initial': b'', 'window_ns': 0, 'scan_limit': 0}, 'window_ns >= 0'),
+        *(
+            (ReplayHistory, {'initial': b'', 'window_ns': 0, **change}, 'a history needs')
+            for change in ({'window_ns': -1}, {'scan_limit': 0}, {'state_limit': 3})
+        ),
         (StampGate, {'window_ns': 0, 'max_gap_ns': 1, 'restart_after': 0}, 'restart_after'),
     ],
 )

@@ -164,7 +164,7 @@ def test_what_is_kept_of_equal_sets_changes_no_bit(model, exact, change):
     tracker, N = SetFilter(changed, 600), 600
     b = np.pad(exact['B'][3], changed.pad)
     record = tracker.record(b, (1, 2))
-    sets = tracker.start(record).sets.take(np.random.default_rng(0).integers(0, 90, N))
+    sets = tracker.start(record).sets.take(np.random.default_rng(0).integers(0, 500, N))
     uniform = np.random.default_rng(3).random((N, changed.uniforms))
     moved, ratio, jump = tracker._drawn(sets, record, uniform)
     step = tracker.weigh(Weighted(moved, np.zeros(N)), record)
