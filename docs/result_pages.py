@@ -153,8 +153,9 @@ class Numbers:
         return [name for name in self.at(path) if part in name] if self.has(path) else []
 
     def sources(self) -> str:
-        """Return one line with the files that were read so far and stand below no table."""
-        return '; '.join(map(self.made, sorted(self.files.keys() - self.captioned)))
+        """Return one line with the files that were read so far and stand below no table, if any."""
+        others = '; '.join(map(self.made, sorted(self.files.keys() - self.captioned)))
+        return others and f'<small>Numbers in the text: {others}</small>'
 
 
 def rendered(template: Path, folder: Path = RESULTS) -> str:
