@@ -6,26 +6,40 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The cost of a step of each tracker, as a file of results: what `sonar-imm bench` measures.
+"""The cost of a step of each tracker, as a file of results: what `sonar-imm bench` measures; of a
+record by kernels for other processors; and of the first start.
 
-python -m benchmarks.speed --out docs/results/speed.json
+    python -m benchmarks.speed --out docs/results/speed.json
+    python -m benchmarks.speed --parts "first start" --add --out docs/results/speed.json
+
+`first start`: compiling the kernels, in a fresh process with an empty folder for them: the tracker
+is built and warmed (`trackers.Tracker.warm`) for the inputs of the case. CPU and wall seconds are
+those of warming, without the import of Python's libraries; kernels are functions of the package,
+as many as were compiled; compilations count those that numba makes of its own functions too, and
+every combination of argument types; kB are those of the machine code kept on disk.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 import hashlib
 import json
 import os
+from pathlib import Path
 import subprocess
 import sys
 import tempfile
+import time
 from typing import Any
 
+from attrs import field, frozen
 import numpy as np
 
 from benchmarks.speed import benches_of
 from benchmarks.speed.fathometer import bench_record, FathometerConfig, FathometerTracker, trace
-from benchmarks.study import Parts, study
+from benchmarks.study import in_fresh_process, Parts, study
+from sonar_imm import measurements
+from sonar_imm.trackers import SYSTEMS
 
 STEPS = ('diver step', 'diver clutter', 'obstacle ping', 'bathymetry numpy', 'fathometer record')
 """System and name of the benches that the page on speed shows."""
@@ -35,16 +49,23 @@ TARGETS = {
     'generic': {'NUMBA_CPU_NAME': 'generic', 'NUMBA_CPU_FEATURES': ''},
 }
 """Processors that numba compiles for, by its own variables: see docker/numba_target.sh."""
+PARTS = ('steps', 'kernel targets', 'first start')
 
 
-def main(rounds: int = 7, steps: tuple[str, ...] = STEPS, targets: bool = True) -> Parts:
-    yield {'rounds': rounds, 'load': os.getloadavg()[0], 'processors': os.cpu_count()}
-    for step in steps:
+def main(rounds: int = 7, parts: Sequence[str] = PARTS) -> Parts:
+    if 'steps' in parts:
+        yield {'rounds': rounds, 'load': os.getloadavg()[0], 'processors': os.cpu_count()}
+    for step in STEPS if 'steps' in parts else ():
         system, name = step.split()
         (bench,) = (bench for bench in benches_of(system) if bench.name == name)
         yield {'steps': {step: bench.measure(rounds)}}
-    if targets:
+    if 'kernel targets' in parts:
         yield {'kernel targets': kernel_targets(rounds)}
+    for name, case in STARTS.items() if 'first start' in parts else ():
+        with tempfile.TemporaryDirectory() as cache:
+            # Read when numba is imported, which the process does before it is called.
+            os.environ['NUMBA_CACHE_DIR'] = cache
+            yield {'first start': {name: in_fresh_process(cold_start, case, cache)}}
 
 
 def kernel_targets(rounds: int) -> dict[str, Any]:
@@ -85,5 +106,61 @@ def child() -> None:
     print(json.dumps({'ms': ms, 'digest': digest.hexdigest()}))
 
 
+# -- the first start ------------------------------------------------------------------------------
+
+
+@frozen
+class Case:
+    """A system, its inputs (classes of `sonar_imm.measurements`, none: all) and parameters beside
+    the defaults."""
+
+    system: str
+    inputs: tuple[str, ...] = ()
+    parameters: Mapping[str, Any] = field(factory=dict)
+
+
+STARTS = {
+    'bathymetry, defaults': Case('bathymetry', ('Snapshot',)),
+    'bathymetry, with navigation': Case(
+        'bathymetry', ('Snapshot', 'Navigation'), {'navigation': 'required'}
+    ),
+    'bathymetry, everything': Case('bathymetry', (), {'navigation': 'required'}),
+    'fathometer, traces': Case('fathometer', ('Trace',)),
+    'fathometer, heave': Case('fathometer', ('Trace',), {'heave': 'memory'}),
+    'fathometer, both polarities': Case('fathometer', ('Trace',), {'polarity': 'both'}),
+    'fathometer, everything': Case('fathometer', (), {'heave': 'memory', 'polarity': 'both'}),
+}
+
+
+def cold_start(case: Case, cache: str) -> dict[str, float]:
+    """Warm a tracker where nothing has been compiled yet; for a process of its own."""
+    from numba.core import event
+
+    compiled: list[tuple[str, str]] = []
+
+    class Counter(event.Listener):
+        def on_start(self, event: Any) -> None:
+            pass
+
+        def on_end(self, event: Any) -> None:
+            function = event.data['dispatcher'].py_func
+            compiled.append((function.__module__, function.__qualname__))
+
+    system = SYSTEMS[case.system]
+    config = system.config_type()(**case.parameters)
+    tracker = system.build(config)
+    inputs = {getattr(measurements, name) for name in case.inputs}
+    cpu, wall = time.process_time(), time.perf_counter()
+    with event.install_listener('numba:compile', Counter()):
+        tracker.warm(inputs or None)
+    return {
+        'CPU s': time.process_time() - cpu,
+        'wall s': time.perf_counter() - wall,
+        'kernels': len({name for name in compiled if name[0].startswith('sonar_imm')}),
+        'compilations': len(compiled),
+        'kB': round(sum(path.stat().st_size for path in Path(cache).rglob('*.nbc')) / 1000),
+    }
+
+
 if __name__ == '__main__':
-    study(main)
+    study(main, parts={'choices': PARTS})
