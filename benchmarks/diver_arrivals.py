@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.diver_families import INSIDE
+from benchmarks.diver_accuracy import INSIDE
 from benchmarks.study import final_estimates, first_track, Parts, study, truths
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Arrivals

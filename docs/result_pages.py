@@ -11,7 +11,7 @@
 Whole pages: ``docs/templates/NAME.md.j2`` makes ``docs/results/NAME.md``. Single tables in pages
 written by hand: ``docs/templates/tables/NAME.md.j2`` replaces the table with the same head.
 Templates take numbers by path, names joined by `>`: the first is the file below docs/results, the
-others lead to the number, as in ``diver_families>paths>legs, 1 m, 1>raw``.
+others lead to the number, as in ``diver_accuracy>paths>legs, 1 m, 1>raw``.
 """
 
 from __future__ import annotations
