@@ -11,35 +11,25 @@ record by kernels for other processors; and of the first start.
 
     python -m benchmarks.speed --out docs/results/speed.json
     python -m benchmarks.speed --parts "first start" --add --out docs/results/speed.json
-
-`first start`: compiling the kernels, in a fresh process with an empty folder for them: the tracker
-is built and warmed (`trackers.Tracker.warm`) for the inputs of the case. CPU and wall seconds are
-those of warming, without the import of Python's libraries; kernels are functions of the package,
-as many as were compiled; compilations count those that numba makes of its own functions too, and
-every combination of argument types; kB are those of the machine code kept on disk.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import hashlib
 import json
 import os
-from pathlib import Path
 import subprocess
 import sys
 import tempfile
-import time
 from typing import Any
 
-from attrs import field, frozen
 import numpy as np
 
 from benchmarks.speed import benches_of
+from benchmarks.speed.cold_start import cold_start, STARTS
 from benchmarks.speed.fathometer import bench_record, FathometerConfig, FathometerTracker, trace
 from benchmarks.study import in_fresh_process, Parts, study
-from sonar_imm import measurements
-from sonar_imm.trackers import SYSTEMS
 
 STEPS = ('diver step', 'diver clutter', 'obstacle ping', 'bathymetry numpy', 'fathometer record')
 """System and name of the benches that the page on speed shows."""
@@ -104,62 +94,6 @@ def child() -> None:
         for estimate in tracker.process(trace(record, rng)):
             digest.update(estimate.state.tobytes() + estimate.probabilities.tobytes())
     print(json.dumps({'ms': ms, 'digest': digest.hexdigest()}))
-
-
-# -- the first start ------------------------------------------------------------------------------
-
-
-@frozen
-class Case:
-    """A system, its inputs (classes of `sonar_imm.measurements`, none: all) and parameters beside
-    the defaults."""
-
-    system: str
-    inputs: tuple[str, ...] = ()
-    parameters: Mapping[str, Any] = field(factory=dict)
-
-
-STARTS = {
-    'bathymetry, defaults': Case('bathymetry', ('Snapshot',)),
-    'bathymetry, with navigation': Case(
-        'bathymetry', ('Snapshot', 'Navigation'), {'navigation': 'required'}
-    ),
-    'bathymetry, everything': Case('bathymetry', (), {'navigation': 'required'}),
-    'fathometer, traces': Case('fathometer', ('Trace',)),
-    'fathometer, heave': Case('fathometer', ('Trace',), {'heave': 'memory'}),
-    'fathometer, both polarities': Case('fathometer', ('Trace',), {'polarity': 'both'}),
-    'fathometer, everything': Case('fathometer', (), {'heave': 'memory', 'polarity': 'both'}),
-}
-
-
-def cold_start(case: Case, cache: str) -> dict[str, float]:
-    """Warm a tracker where nothing has been compiled yet; for a process of its own."""
-    from numba.core import event
-
-    compiled: list[tuple[str, str]] = []
-
-    class Counter(event.Listener):
-        def on_start(self, event: Any) -> None:
-            pass
-
-        def on_end(self, event: Any) -> None:
-            function = event.data['dispatcher'].py_func
-            compiled.append((function.__module__, function.__qualname__))
-
-    system = SYSTEMS[case.system]
-    config = system.config_type()(**case.parameters)
-    tracker = system.build(config)
-    inputs = {getattr(measurements, name) for name in case.inputs}
-    cpu, wall = time.process_time(), time.perf_counter()
-    with event.install_listener('numba:compile', Counter()):
-        tracker.warm(inputs or None)
-    return {
-        'CPU s': time.process_time() - cpu,
-        'wall s': time.perf_counter() - wall,
-        'kernels': len({name for name in compiled if name[0].startswith('sonar_imm')}),
-        'compilations': len(compiled),
-        'kB': round(sum(path.stat().st_size for path in Path(cache).rglob('*.nbc')) / 1000),
-    }
 
 
 if __name__ == '__main__':
