@@ -18,9 +18,9 @@ stamps from the first fix on.
 `paths`: 33 paths against every single family of motion, told the truth: boats, scooters, swimmers
 in legs, circles and zigzags, divers who stand, loiter or drift; three paths were recorded (an
 AUV's dead reckoning, two boats), their fixes are simulated. Some fixes state a sixth of their
-variance. The best in hindsight is the least RMSE of the raw fixes, two heading sets and five constant
-velocities, each alone, told the true covariance and without a gate. `ratio` is the RMSE of
-`model_set: families`, told what the fixes state, over that. NEES is of the position, 2 is due;
+variance. The best in hindsight is the least RMSE of the raw fixes, two heading sets and five
+constant velocities, each alone, told the true covariance and without a gate. `ratio` is the RMSE
+of `model_set: families`, told what the fixes state, over that. NEES is of the position, 2 is due;
 fixes before the tenth do not count.
 """
 
