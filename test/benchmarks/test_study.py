@@ -62,6 +62,21 @@ def test_the_file_holds_what_is_known_when_a_run_is_broken_off(monkeypatch, tmp_
     assert study.known(tmp_path / 'none') == study.known(None) == {}
 
 
+def test_a_run_is_put_beside_what_is_in_the_file(monkeypatch, tmp_path):
+    file = tmp_path / 'numbers.json'
+    run(monkeypatch, numbers, '--cases', 'a', '--out', file)
+    before = json.loads(file.read_text())['made']
+    for _ in range(2):
+        run(monkeypatch, numbers, '--cases', 'b', '--runs', 2, '--add', '--out', file)
+    assert study.known(file)['table'] == {
+        'a': {'error': 0.375, 'n': 3},
+        'b': {'error': 0.25, 'n': 2},
+    }
+    made = json.loads(file.read_text())['made']
+    assert made['date'] == before['date'] and made['command'].startswith(before['command'] + '; ')
+    assert made['command'].count(' at commit ') == 1
+
+
 def test_a_fresh_process_is_another_one_and_its_errors_arrive():
     assert study.in_fresh_process(os.getpid) != os.getpid()
     with pytest.raises(ZeroDivisionError):
@@ -79,7 +94,7 @@ def commands():
 
 
 @pytest.mark.filterwarnings('ignore:.*found in sys.modules')
-@pytest.mark.parametrize('command', commands())
+@pytest.mark.parametrize('command', [*commands()])
 def test_the_command_of_every_result_works(command, monkeypatch):
     """Its study is there, and has the options and choices; nothing is run."""
     name, *words = shlex.split(command)
