@@ -93,6 +93,11 @@ def test_the_strongest_comes_first():
     echoes = found(image(Point(15.0, 0.1, 22.0), Point(30.0, -0.2, 35.0)))
     assert echoes.range == pytest.approx([30.0, 15.0], abs=0.1)
     assert echoes.snr[0] > echoes.snr[1] and echoes.amplitude[0] > echoes.amplitude[1]
+    # Of a point: half a width over the amplitude ratio, and a tenth of a step.
+    of_range, of_bearing = 0.15**2, np.radians(0.5) ** 2
+    assert echoes.var_range[1] == pytest.approx(of_range / echoes.snr[1] + 0.01**2)
+    of_step = np.radians(0.025) ** 2
+    assert echoes.var_bearing[1] == pytest.approx(of_bearing / echoes.snr[1] + of_step)
 
 
 def test_an_onset_of_the_sea_floor_is_no_echo():
