@@ -115,8 +115,6 @@ def test_headings_and_the_velocity_they_put_out():
         ({'directions': 3}, 'between 4 and 64'),
         ({'sped_mean': 1.0}, "did you mean 'speed_mean'"),
         ({'target': 'bot'}, 'did you mean|must be one of'),
-        ({'systematic_errors': 'exact', 'receiver_clock_std': 1e-4}, 'receiver_clock_std'),
-        ({'confirm_hits': 8, 'confirm_window': 7}, 'cannot exceed confirm_window'),
         ({'coverage_sector': [0.0, 0.0]}, 'coverage_sector needs 6 values, got 2'),
         ({'coverage_sector': [0, 0, 0, 0, 0, 9]}, 'a width of 0 is not between 0 and 360'),
         ({'coverage_sector': [0, 0, 0, 90, 9, 9]}, 'a range from 9 to 9 holds nothing'),
@@ -132,6 +130,18 @@ def test_headings_and_the_velocity_they_put_out():
 def test_bad_parameters_get_a_sentence(values, says):
     with pytest.raises(ConfigError, match=says):
         DiverConfig.from_mapping(values)
+
+
+@pytest.mark.parametrize(
+    ('values', 'says'),
+    [
+        ({'systematic_errors': 'exact', 'receiver_clock_std': 1e-4}, 'receiver_clock_std'),
+        ({'confirm_hits': 8, 'confirm_window': 7}, 'cannot exceed confirm_window'),
+    ],
+)
+def test_constants_that_contradict_parameters_get_one_too(values, says):
+    with pytest.raises(ConfigError, match=says):
+        DiverConfig(**values)
 
 
 def test_a_given_matrix_is_used_in_its_orientation():

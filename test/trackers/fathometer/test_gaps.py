@@ -204,12 +204,12 @@ def test_layers_that_dip_are_followed_without_a_parameter(kind, dip, gap):
 
 
 def test_layers_that_are_still_are_called_so():
-    traces, truth = dipping('parallel', 0.0, 0, 0)
-    tracker, found = run(traces, **MANY)
+    traces, _ = dipping('parallel', 0.0, 0, 0)
+    _, found = run(traces, particles=2000)
     last = max(found.values(), key=lambda each: each.stamp_ns)
     assert len(last) == len(DIPPING) and last.extras['dipping'].mean() < 0.3
     dips, _ = dipping('parallel', -0.2, 0, 0)
-    _, found = run(dips, **MANY)
+    _, found = run(dips, particles=2000)
     last = max(found.values(), key=lambda each: each.stamp_ns)
     assert last.extras['dipping'].mean() > 0.9
     # A walk of .1 m over 30 records leaves .02 m.

@@ -177,7 +177,7 @@ def test_a_new_spread_of_the_heave_begins_anew(heaving):
 
 
 ARRAY = 30.0  # m, of the scene
-EXACT = {'sound_speed_std': 5.0, 'particles': 1000}
+EXACT = {'sound_speed_std': 5.0, 'particles': 500}
 """For what holds whatever the particles are."""
 
 
@@ -189,7 +189,7 @@ def drawn():
 def followed(drawn, **options):
     """Of the later records: depths, true ones by the speed of the scene, variances, estimates."""
     traces, truth = drawn
-    _, found = run(traces, **{'particles': 3000, 'array_depth_std': 0.03, **options})
+    _, found = run(traces, **{'particles': 1500, 'array_depth_std': 0.03, **options})
     rows = [(each, z) for each, z in zip(found.values(), truth) if len(each) == len(z)][5:]
     assert len(rows) > 15
     depth = np.array([each.state[:, 0] for each, _ in rows])
