@@ -200,6 +200,14 @@ def test_a_sector_scanned_to_and_fro_gives_a_ping_each_way():
     assert [ping.bearing[0] for ping in found] == pytest.approx([0.1] * 3, abs=0.03)
 
 
+def test_the_direction_where_a_sonar_turns_back_is_in_both_sweeps(monkeypatch):
+    monkeypatch.setattr('sonar_imm.trackers.obstacle.detector.detect', lambda image, config: image)
+    once = np.arange(-0.5, 0.5, STEP)
+    found = sweeps(beams(np.concatenate([once, once[-2::-1], once[1:], once[-2::-1]])))
+    for image, seen in zip(found, (once, once[::-1], once), strict=True):
+        np.testing.assert_allclose(image.bearing, seen)
+
+
 def test_each_echo_of_a_sweep_has_the_time_of_its_direction():
     once = np.arange(-0.5, 0.5, STEP)
     for target in (0.0, 0.35):

@@ -25,6 +25,7 @@ from sonar_imm.trackers.obstacle import ground as ground_module
 from sonar_imm.trackers.obstacle.beam import apply_elevations, Elevations, expected_elevations
 from sonar_imm.trackers.obstacle.filters import depth_span, HeightPrior, Mixture, Sonar
 from sonar_imm.trackers.obstacle.ground import Cells, GroundMap
+from sonar_imm.trackers.obstacle.pings import Echoes
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
@@ -278,6 +279,24 @@ def test_an_echo_meets_the_floor_where_it_is():
     assert found == pytest.approx(below, abs=0.1) and (std < 0.3).all()
     away, _ = ground.below(np.array([[95.0, 0.0]]), sonar, ObstacleConfig())
     assert np.isnan(away).all()
+
+
+@pytest.mark.parametrize('sounded', [False, True])
+@pytest.mark.parametrize('elevation', [np.nan, 0.02])
+def test_new_obstacles_have_the_elevation_and_the_floor_that_are_known(sounded, elevation):
+    ping = Detections(
+        stamp_ns=SECOND, range=[20.0], bearing=[0.1], elevation=[elevation], var_elevation=[1e-4]
+    )
+    ground, config = GroundMap(), ObstacleConfig()
+    if sounded:
+        ground = ground.added(soundings(sloping(np.random.default_rng(3))))
+    sonar = Sonar(geometry.Pose(np.array([0.0, 0.0, 20.0]), np.eye(3)), altitude=6.0)
+    prior = Echoes.of(ping, config).height_prior(sonar, ground, config)
+    if prior is None:
+        assert not sounded and np.isnan(elevation)
+    else:
+        assert np.isfinite(prior.elevations).all() == np.isfinite(elevation)
+        assert np.isfinite(prior.floor).all() == np.isfinite(prior.floor_std).all() == sounded
 
 
 RISE = 0.05
