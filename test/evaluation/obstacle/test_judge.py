@@ -17,11 +17,11 @@ import pytest
 from scipy.special import ndtr
 
 from sonar_imm.estimates import Estimate, places
-from sonar_imm.measurements import Altitude, Detections
+from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
-from sonar_imm_tools.evaluation.obstacle.figures import error_figure, image_figure
+from sonar_imm_tools.evaluation.obstacle.figures import error_figure, image_figure, map_section
 from sonar_imm_tools.evaluation.obstacle.scoring import (
     forecast_scores,
     forecasts,
@@ -87,6 +87,22 @@ def test_the_image_is_seen_from_above_with_starboard_to_the_right():
     ):
         np.testing.assert_allclose(np.ravel(drawn.x), -distance * np.sin(bearing), atol=0.01)
         np.testing.assert_allclose(np.ravel(drawn.y), distance * np.cos(bearing), atol=0.01)
+
+
+def test_the_map_shows_the_way_and_names_each_track():
+    rows = [[k, 1, 10.0 * k, 0.2, 3.0, 1.0, 2.0, 5.0, 0.1] for k in (4, 7)]
+    level = [0.0, 0.0, 0.0, 1.0]
+    way = [
+        Navigation(stamp_ns=s * SECOND, position=[3.0 * s, s, 0.0], orientation=level)
+        for s in (1, 2)
+    ]
+    (section,) = map_section(series_of([estimate(10, rows)]), way, None)
+    vehicle, *tracks = section.figure.data
+    assert list(vehicle.x) == [3.0, 6.0] and list(vehicle.y) == [1.0, 2.0]
+    assert vehicle.hovertemplate is None
+    for track, number, x in zip(tracks, (4, 7), (40.0, 70.0), strict=True):
+        assert list(track.x) == [x] and list(track.y) == pytest.approx([0.2])
+        assert track.hovertemplate.startswith(f'track {number}: ')
 
 
 def test_scores_are_those_done_by_hand():
