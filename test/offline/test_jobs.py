@@ -9,9 +9,14 @@
 """Processes that share work, where they cannot."""
 
 from multiprocessing import synchronize
+import os
 import socket
+import subprocess
+import sys
+import time
 
 from helpers.dying import work
+from helpers.source import ROOT
 import pytest
 
 from sonar_imm.parameters import ConfigError
@@ -60,3 +65,26 @@ def test_a_missing_scheduler_is_one_sentence(monkeypatch):
         cluster(address).__enter__()
     with pytest.raises(ConfigError, match='no dask scheduler at nonsense: .*port'):
         cluster('nonsense').__enter__()
+
+
+def test_the_example_of_slurm_hands_in_its_jobs_and_cancels_them(tmp_path):
+    """By commands that stand in for those of Slurm, and keep what they are given."""
+    pytest.importorskip('dask_jobqueue')
+    (tmp_path / 'sbatch').write_text(f'#!/bin/sh\ncp $1 {tmp_path}/$$.job\necho job $$\n')
+    (tmp_path / 'scancel').write_text(f'#!/bin/sh\ntouch {tmp_path}/$1.gone\n')
+    for name in ('sbatch', 'scancel'):
+        (tmp_path / name).chmod(0o755)
+    example = subprocess.Popen(
+        [sys.executable, ROOT / 'examples' / 'howto' / 'slurm_cluster.py'], text=True,
+        env={**os.environ, 'PATH': f'{tmp_path}:{os.environ["PATH"]}'}, cwd=tmp_path,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    end = time.monotonic() + 60.0
+    while len(list(tmp_path.glob('*.job'))) < 4 and time.monotonic() < end:
+        time.sleep(0.1)
+    address = example.communicate('\n', timeout=60)[0].splitlines()[0]
+    jobs = {path.stem: path.read_text() for path in tmp_path.glob('*.job')}
+    assert len(jobs) == 4 and {path.stem for path in tmp_path.glob('*.gone')} == set(jobs)
+    for text in jobs.values():
+        assert '#SBATCH --cpus-per-task=16' in text and '. /data/venv/bin/activate' in text
+        assert f'{address} ' in text and '--nworkers 16 ' in text

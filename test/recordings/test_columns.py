@@ -243,6 +243,11 @@ def test_commas_in_numbers(table, text, value):
         ('status', '4 5 0', 3),
         ('status', 'A B C', 3),
         ('valid', '1 0 true', 2),
+        ('Kvalitet', 'god feil ok bad', 2),
+        ('quality', 'good fair invalid', 2),
+        ('Fix Quality', 'fix float 0 1 no', 4),
+        ('quality,valid', 'bad,1 ok,0 ok,1', 1),
+        ('quality', 'n 0 f', 3),
     ],
 )
 def test_words_for_bad_rows(table, header, words, kept):

@@ -253,6 +253,13 @@ def test_traces_without_a_date_begin_when_the_user_says(tmp_path):
     line = read_segy(path, start='2021-03-01T10:00:00Z', rate=4.0)
     assert line.stamps == [TEN * 10**9 + k * 250_000_000 for k in range(3)]
     assert '--rate' in line.questions[0]
+    last = read_segy(write(path, year=2020, day=366)).stamps[0]
+    assert last == round(datetime(2020, 12, 31, 10, tzinfo=timezone.utc).timestamp()) * 10**9
+    write(path, year=[2020, 2021, 2021], day=366)
+    with pytest.raises(BagError, match='trace 2 is of day 366 of 2021, which is no date.*--start'):
+        read_segy(path)
+    line = read_segy(path, start='2021-03-01T10:00:00Z')
+    assert line.stamps[0] == TEN * 10**9 and 'day 366' in line.questions[0]
     # A time of day without a date goes on over midnight.
     path = write(tmp_path / 'night.sgy', year=0, day=0, hour=[23, 23, 0], minute=[58, 59, 0])
     line = read_segy(path, start='2021-03-01T10:00:00Z')
