@@ -8,8 +8,8 @@
 
 """A dask cluster on Slurm, until Enter is pressed. Prints the address of its scheduler.
 
-Run with dask-jobqueue 0.9 and a stand-in for sbatch, as in test/offline/test_jobs.py: the scripts
-of four jobs are handed in, and cancelled at the end. Not run on a Slurm of its own.
+Run with dask-jobqueue 0.9 and a stand-in for sbatch, as in test/offline/test_tracking.py: the
+scripts of four jobs are handed in, and cancelled at the end. Not run on a Slurm of its own.
 """
 
 from dask_jobqueue import SLURMCluster

@@ -89,21 +89,15 @@ def test_tags_are_numbers_or_their_place_in_the_list():
     assert tag_numbers([]) == {}
 
 
-def test_a_part_of_the_topic_is_a_name_and_a_part_of_that_is_none():
+def test_a_part_of_the_topic_or_a_frame_is_a_name():
     tags = {'tags': ['amy', 'bob']}
     assert label('/divers/bob/fix', fix(), **tags).target_id == 2
     assert label('/divers/bobby/fix', fix(), **tags).target_id == NOBODY
     assert label('bob/fix', fix(), **tags).target_id == 2
-
-
-def test_a_frame_is_a_name_and_then_the_frame_is_the_map():
     named = label('/fix', fix('amy'), tags=['amy'], frame_id='odom')
     assert (named.target_id, named.frame_id) == (1, 'odom')
     other = label('/fix', fix('map'), tags=['amy'])
     assert (other.target_id, other.frame_id) == (NOBODY, 'map')
-
-
-def test_what_a_message_says_itself_stays():
     assert label('/bob/fix', fix(target_id=40), tags=['bob']).target_id == 40
     assert label('/fix', fix('bob', target_id=40), tags=['bob']).frame_id == 'bob'
 
@@ -113,9 +107,6 @@ def test_sensors_are_labelled_and_scans_are_no_tags():
     labels = Labels.of('/radar/fixes', {'sensors': ['radar'], 'tags': ['amy']}, ('sensors',))
     assert labels(scan).sensor == 'radar'
     assert label('/radar/fix', fix(), sensors=['radar']).sensor == 'radar'
-
-
-def test_without_names_nothing_is_labelled():
     assert Labels.of('/bob/fix', {'tags': [], 'sensors': []}, BOTH) is None
 
 
