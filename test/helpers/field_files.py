@@ -29,6 +29,7 @@ from helpers.sonar_files import (
     xtf_head,
     xtf_soundings,
 )
+from msg_adapters.estimates import read_estimate
 from msg_adapters.navigation import write_navigation
 from sonar_imm.measurements import Navigation
 from sonar_imm_tools.recordings.measurements import measurements_of
@@ -273,6 +274,12 @@ def measured(path, system='diver', topics=None):
     """What a tracker hears of a recording."""
     with BagReader(path) as bag:
         return [item.measurement for item in measurements_of(bag, system, topics)]
+
+
+def truth_of(path):
+    """The true estimates of a recording."""
+    with BagReader(path) as bag:
+        return [read_estimate(item.message) for item in bag.messages(['/truth/estimate'])]
 
 
 def bag_of(path, spots, messages, types=None):

@@ -9,6 +9,7 @@
 from array import array
 from importlib import import_module
 import math
+from types import SimpleNamespace
 
 from attrs import evolve
 from helpers.refusals import reason
@@ -25,6 +26,7 @@ from msg_adapters.estimates import (
     write_odometry,
 )
 from msg_adapters.fixes import read_fix, write_fix
+from msg_adapters.headers import make_header, stamp_ns, to_enu
 from msg_adapters.soundings import read_soundings, write_soundings
 from msg_adapters.table import encode_table
 from sonar_imm.estimates import Estimate, PLACES
@@ -286,6 +288,76 @@ def test_markers_of_a_track_that_is_over_are_deleted_at_once():
     assert name == 'markers' and [marker.action for marker in message.markers] == [DELETE_ALL]
 
 
+# -- stamps and frames
+
+
+def fix(frame_id='map'):
+    return Fix(
+        stamp_ns=1700000000123456789, position=(1.0, 2.0, 3.0), frame_id=frame_id,
+        covariance=[[4.0, 0.5], [0.5, 9.0]],
+    )  # fmt: skip
+
+
+def arrivals(**changes):
+    usual = {
+        'stamp_ns': 10**18, 'tx_id': [1, 1], 'rx_id': [2, 3], 'tx': [[1.0, 2.0, 3.0]] * 2,
+        'rx': [[4.0, 5.0, 6.0]] * 2, 'toa': [0.1, 1 / 3], 'var_toa': np.float32([1e-6, np.nan]),
+        'bearing': [0.25, -0.4], 'var_bearing': np.float32([0.01, 0.02]), 'frame_id': 'map',
+    }  # fmt: skip
+    return Arrivals(**{**usual, **changes})
+
+
+@pytest.mark.parametrize(
+    'stamp',
+    [0, 7, 1_000_000_007, 2**31 * 10**9 - 1, 1700000000123456789, -1, -(2**31) * 10**9],
+)
+def test_stamps_round_trip_exactly(stamp):
+    header = make_header(stamp, 'map', ros_message)
+    assert stamp_ns(SimpleNamespace(header=header)) == stamp
+
+
+def test_a_stamp_that_a_header_cannot_hold_is_none():
+    for beyond in (2**31 * 10**9, -(2**31) * 10**9 - 1):
+        with pytest.raises(ValueError, match='cannot hold'):
+            make_header(beyond, 'map', ros_message)
+    message = SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=10**9)))
+    assert reason(stamp_ns, message) == 'bad_stamp'
+
+
+def as_read(measurement, world_frame):
+    """The measurement sent as a message and read again by a reader that is told `world_frame`."""
+    write, read = {Fix: (write_fix, read_fix), Arrivals: (write_arrivals, read_arrivals)}[
+        type(measurement)
+    ]
+    return read(write(measurement, ros_message), world_frame=world_frame)
+
+
+def test_a_measurement_turns_from_ned_to_enu():
+    turned = as_read(fix('map_ned'), 'ned')
+    assert turned.position.tolist() == [2.0, 1.0, -3.0] and turned.frame_id == 'map'
+    assert turned.covariance[:2, :2].tolist() == [[9.0, 0.5], [0.5, 4.0]]
+    for bearing in (-3.0, 0.25, 1.0, 3.1):
+        north, east = np.cos(bearing), np.sin(bearing)
+        turned = as_read(arrivals(bearing=[bearing] * 2, frame_id='map_ned'), 'ned')
+        assert np.cos(turned.bearing[0]) == pytest.approx(east)
+        assert np.sin(turned.bearing[0]) == pytest.approx(north)
+    assert turned.tx[0].tolist() == [2.0, 1.0, -3.0] and turned.rx[0].tolist() == [5.0, 4.0, -6.0]
+    twice = as_read(as_read(arrivals(frame_id='map_ned'), 'ned'), 'ned')
+    assert np.allclose(twice.bearing, [0.25, -0.4]) and (twice.tx == arrivals().tx).all()
+    assert twice.frame_id == 'map'
+
+
+def test_a_ned_frame_is_refused_under_enu_and_read_under_ned():
+    for measurement in (fix('map_ned'), arrivals(frame_id='map_ned')):
+        with pytest.raises(Rejection, match='north-east-down') as caught:
+            as_read(measurement, 'enu')
+        assert caught.value.reason == 'frame_ned'
+        assert as_read(measurement, 'ned').frame_id == 'map'
+    assert as_read(fix(), 'enu').position.tolist() == [1.0, 2.0, 3.0]
+    with pytest.raises(ValueError, match='enu, ned'):
+        to_enu(fix(), 'nwu', lambda same: same)
+
+
 # -- rclpy's messages and rosbags' messages are the same to the adapters and on the wire
 
 
@@ -314,21 +386,6 @@ def make_rclpy(type_name, /, **fields):
         if isinstance(value, np.ndarray) and key != 'covariance':
             fields[key] = array('B' if value.dtype == np.uint8 else 'd', value.tobytes())
     return get_message(type_name)(**fields)
-
-
-def fix():
-    return Fix(
-        stamp_ns=1700000000123456789, position=(1 / 3, 2.0, 3.0),
-        covariance=[[4.0, 0.5], [0.5, 9.0]], frame_id='map',
-    )  # fmt: skip
-
-
-def arrivals():
-    return Arrivals(
-        stamp_ns=10**18, tx_id=[1, 1], rx_id=[2, 3], tx=np.ones((2, 3)), rx=np.zeros((2, 3)),
-        toa=[0.1, 1 / 3], var_toa=np.float32([1e-6, np.nan]), bearing=[0.3, -0.4],
-        var_bearing=np.float32([0.01, 0.02]), frame_id='map',
-    )  # fmt: skip
 
 
 def messages(make):

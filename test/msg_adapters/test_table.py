@@ -18,11 +18,8 @@ import numpy as np
 import pytest
 
 from msg_adapters import table
-from msg_adapters.arrivals import read_arrivals, write_arrivals
-from msg_adapters.fixes import read_fix, write_fix
-from msg_adapters.headers import make_header, stamp_ns, to_enu
 from msg_adapters.table import decode_table, encode_table
-from sonar_imm.measurements import Arrivals, Fix, Rejection
+from sonar_imm.measurements import Rejection
 from sonar_imm_tools.recordings.messages import ros_message, typestore
 
 FORMATS = list(table.DATATYPES.values())
@@ -282,74 +279,3 @@ def test_a_table_says_whether_all_of_it_is_finite(rows, bad):
     for more, dense in (({}, True), ({'v': np.ones((rows, 2))}, True), ({'b': spoilt}, False),
                         ({'v': pair}, False)):  # fmt: skip
         assert encode({**good, **more}).is_dense == dense
-
-
-# -- stamps and frames
-
-
-def fix(frame_id='map'):
-    return Fix(
-        stamp_ns=5, position=(1.0, 2.0, 3.0), covariance=[[4.0, 0.5], [0.5, 9.0]],
-        frame_id=frame_id,
-    )  # fmt: skip
-
-
-def arrivals(**changes):
-    return Arrivals(
-        **{
-            'stamp_ns': 5, 'tx_id': [1], 'rx_id': [2], 'tx': [[1.0, 2.0, 3.0]],
-            'rx': [[4.0, 5.0, 6.0]], 'toa': [0.1], 'var_toa': [np.nan], 'bearing': [0.25],
-            'var_bearing': [0.01], 'frame_id': 'map_ned', **changes,
-        }
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    'stamp',
-    [0, 7, 1_000_000_007, 2**31 * 10**9 - 1, 1700000000123456789, -1, -(2**31) * 10**9],
-)
-def test_stamps_round_trip_exactly(stamp):
-    header = make_header(stamp, 'map', ros_message)
-    assert stamp_ns(SimpleNamespace(header=header)) == stamp
-
-
-def test_a_stamp_that_a_header_cannot_hold_is_none():
-    for beyond in (2**31 * 10**9, -(2**31) * 10**9 - 1):
-        with pytest.raises(ValueError, match='cannot hold'):
-            make_header(beyond, 'map', ros_message)
-    message = SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=10**9)))
-    assert reason(stamp_ns, message) == 'bad_stamp'
-
-
-def as_read(measurement, world_frame):
-    """The measurement sent as a message and read again by a reader that is told `world_frame`."""
-    write, read = {Fix: (write_fix, read_fix), Arrivals: (write_arrivals, read_arrivals)}[
-        type(measurement)
-    ]
-    return read(write(measurement, ros_message), world_frame=world_frame)
-
-
-def test_a_measurement_turns_from_ned_to_enu():
-    turned = as_read(fix('map_ned'), 'ned')
-    assert turned.position.tolist() == [2.0, 1.0, -3.0] and turned.frame_id == 'map'
-    assert turned.covariance[:2, :2].tolist() == [[9.0, 0.5], [0.5, 4.0]]
-    for bearing in (-3.0, 0.25, 1.0, 3.1):
-        north, east = np.cos(bearing), np.sin(bearing)
-        turned = as_read(arrivals(bearing=[bearing]), 'ned')
-        assert np.cos(turned.bearing[0]) == pytest.approx(east)
-        assert np.sin(turned.bearing[0]) == pytest.approx(north)
-    assert turned.tx.tolist() == [[2.0, 1.0, -3.0]] and turned.rx.tolist() == [[5.0, 4.0, -6.0]]
-    twice = as_read(as_read(arrivals(), 'ned'), 'ned')
-    assert np.allclose(twice.bearing, [0.25]) and (twice.tx == arrivals().tx).all()
-    assert twice.frame_id == 'map'
-
-
-def test_a_ned_frame_is_refused_under_enu_and_read_under_ned():
-    for measurement in (fix('map_ned'), arrivals()):
-        with pytest.raises(Rejection, match='north-east-down') as caught:
-            as_read(measurement, 'enu')
-        assert caught.value.reason == 'frame_ned'
-        assert as_read(measurement, 'ned').frame_id == 'map'
-    assert as_read(fix(), 'enu').position.tolist() == [1.0, 2.0, 3.0]
-    with pytest.raises(ValueError, match='enu, ned'):
-        to_enu(fix(), 'nwu', lambda same: same)

@@ -292,7 +292,7 @@ def test_a_track_begins_where_and_when_the_file_says(tmp_path):
     options = InputOptions(initial=read_initial(path))
     with BagReader(write_dive(tmp_path / 'dive', count=30)) as bag:
         run = OfflineRun(bag, DIVER, DIVER.config_type()(tags=('bob', 'anna')), options)
-        first = next(iter(run.estimates()))
+        first = list(run.estimates())[0]
         assert first.stamp_ns == START_NS and 2 in first.extras['target_id']
         assert (first.extras['track_state'] == 1).any()
         assert run.recipe()['initial'][0]['position'] == (0.0, 0.0, 0.0)

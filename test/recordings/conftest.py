@@ -14,7 +14,9 @@ import pytest
 from msg_adapters.fixes import write_fix
 from sonar_imm.measurements import Fix
 from sonar_imm_tools.recordings.convert import KINDS
+from sonar_imm_tools.recordings.csv_table import CsvTable
 from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.writer import BagWriter
 
 START = 1_700_000_000 * 10**9
@@ -28,6 +30,17 @@ def real_data():
     if not folder.is_dir():
         pytest.skip('no real recordings here; SONAR_IMM_DATA names their folder')
     return folder
+
+
+@pytest.fixture
+def table(tmp_path):
+    """A table of text or bytes."""
+
+    def make(text, **options):
+        (tmp_path / 'a.csv').write_bytes(text if isinstance(text, bytes) else text.encode())
+        return CsvTable(tmp_path / 'a.csv', CsvOptions(**options))
+
+    return make
 
 
 @pytest.fixture

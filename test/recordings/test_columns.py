@@ -13,22 +13,11 @@ from helpers.field_files import measured
 import pytest
 
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.recordings.csv_table import CsvTable
 from sonar_imm_tools.recordings.places import Degrees
 from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.times import BadRow
-
-
-@pytest.fixture
-def table(tmp_path):
-    def make(text, **options):
-        path = tmp_path / 'a.csv'
-        path.write_text(text, encoding='utf-8')
-        return CsvTable(path, CsvOptions(**options))
-
-    return make
 
 
 @pytest.mark.parametrize(

@@ -21,16 +21,6 @@ from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.times import BadRow
 
 
-@pytest.fixture
-def table(tmp_path):
-    def make(text, **options):
-        path = tmp_path / 'a.csv'
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return CsvTable(path, CsvOptions(**options))
-
-    return make
-
-
 @pytest.mark.parametrize(
     'header',
     ['stamp,x,y', 'Time [s];East (m);North (m)', 'timestamp\teasting\tnorthing', 'T  X  Y',

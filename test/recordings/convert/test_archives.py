@@ -12,11 +12,10 @@ import math
 import time
 import zipfile
 
-from helpers.field_files import measured
+from helpers.field_files import measured, truth_of
 import numpy as np
 import pytest
 
-from msg_adapters.estimates import read_estimate
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.geometry import rotation_of_quaternion
 from sonar_imm.measurements import Navigation
@@ -27,14 +26,8 @@ from sonar_imm_tools.recordings.convert import (
     convert_traces,
     KINDS,
 )
-from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
-
-
-def truth_of(path):
-    with BagReader(path) as bag:
-        return [read_estimate(item.message) for item in bag.messages(['/truth/estimate'])]
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import json
 import math
 import struct
 
-from helpers.field_files import measured
+from helpers.field_files import measured, truth_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -21,7 +21,6 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 import yaml
 
-from msg_adapters.estimates import read_estimate
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm_tools.recordings.conversion import MOST_NAMED
 from sonar_imm_tools.recordings.convert import (
@@ -34,11 +33,6 @@ from sonar_imm_tools.recordings.convert import (
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.recordings.truth import difference_velocity, number_names
-
-
-def truth_of(path):
-    with BagReader(path) as bag:
-        return [read_estimate(item.message) for item in bag.messages(['/truth/estimate'])]
 
 
 def test_bad_rows_are_named_by_line_and_the_rest_is_converted(convert):
