@@ -78,8 +78,7 @@ def test_without_truth_the_page_still_says_something(tracked, bag, tmp_path):
 
 
 @pytest.mark.parametrize(
-    'settings',
-    ['angle_two_rw', 'terrain', 'height_rw_ncs', 'height_two_rw --set smoothing=modes'],
+    'settings', ['angle_two_rw', 'terrain', 'height_rw_ncs', 'height_two_rw --set smoothing=modes']
 )
 def test_every_model_set_is_judged(bag, tmp_path, settings):
     words = f'--set model_set={settings}'.split()
