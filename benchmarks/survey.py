@@ -182,8 +182,7 @@ def looks_scores(
     box = (first, first, last - first, last - first)
     nodes = grid_of_looks(soundings, 1.0, box, errors, covariance, crossing_rms)
     place = np.asarray(np.column_stack([nodes.ix, nodes.iy]) + 0.5, np.float64)
-    competing = float(np.mean(nodes.hypotheses > 1))
-    return {**about_level(floor, place, nodes.z, nodes.sd, level_std), 'competing': competing}
+    return about_level(floor, place, nodes.z, nodes.sd, level_std)
 
 
 def about_level(
@@ -195,17 +194,14 @@ def about_level(
     off = error - np.median(error)
     return {
         'rmse': rms(off),
-        'median': float(np.median(np.abs(off))),
-        'beyond': float(np.mean(np.abs(off) > 0.5)),
         'inside': float(np.mean(np.abs(error) < 2.0 * sd)),
         'level_inside': float(np.mean(np.abs(off) < 2.0 * relative)),
-        'relative_sd': float(np.median(relative)),
         'sd': float(np.median(sd)),
     }
 
 
 def walls(seed: int) -> dict[str, float]:
-    """Errors about their median on the sides of the wreck and on all nodes beside it."""
+    """Errors about their median on the sides of the wreck."""
     scene = simulate(scenario('survey', WRECK), seed)
     parts = [
         line_of(points, budget()).corrected(c)
@@ -222,9 +218,7 @@ def walls(seed: int) -> dict[str, float]:
     side = (out > 0.8) & (np.abs(along) < 22.0) & (np.abs(across) < 6.0)
     return {
         'rms': rms(off[side]),
-        'p95': float(np.quantile(off[side], 0.95)),
         'inside': float(np.mean(off[side] < 2.0 * nodes.sd[side])),
-        'others_rms': rms(off[~side & (out > 0.8)]),
     }
 
 
