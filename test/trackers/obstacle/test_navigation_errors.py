@@ -9,10 +9,9 @@
 """Errors of the navigation: their motion, what obstacles tell each other of them, two
 assumptions."""
 
-from pathlib import Path
-
 from attrs import evolve
 from helpers.obstacle_runs import run, SECOND
+from helpers.vector_files import load_vectors
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -29,16 +28,12 @@ from sonar_imm.trackers.obstacle.unscented import Motion, NAV, Step
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 CONFIG = ObstacleConfig()
-VECTORS = Path(__file__).resolve().parents[2] / 'vectors/obstacle_in_clutter'
 ORDER = [0, 1, 2, 5, 6, 7, 8, 9, 3, 4]
 """Of our states in those of the vectors, (d, delta, z, e_N, e_E, s, psi, b_N, b_E, tau)."""
 
 
 def vectors(name):
-    return dict(np.load(VECTORS / f'{name}.npz'))
-
-
-# -- motion ---------------------------------------------------------------------------------------
+    return load_vectors(f'obstacle_in_clutter/{name}')
 
 
 def moved(data, i, x, P):
@@ -84,9 +79,6 @@ def test_the_covariance_of_a_step_is_that_of_its_derivatives(i):
     if data['behaviour'][i] == 0:
         got, exact, width = got[:8, :8], exact[:8, :8], width[:8]
     assert_allclose(got / np.outer(width, width), exact / np.outer(width, width), atol=0.02)
-
-
-# -- messages -------------------------------------------------------------------------------------
 
 
 def linear_tracks(data):
@@ -161,9 +153,6 @@ def test_an_error_that_is_switched_off_is_told_by_nobody():
     assert L[:, :4, :4].any(axis=(1, 2)).all()
 
 
-# -- two assumptions ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize('case', [0, 1, 2])
 def test_both_assumptions_equal_the_vectors(case):
     data = vectors('ins_good')
@@ -233,9 +222,6 @@ def test_nothing_is_split_where_nothing_is_in_doubt():
     found, probability = navigation_errors.under_two_assumptions(mixture, sure, 9.0, certain)
     assert_allclose(probability, 1.0)
     assert np.isfinite(found.x).all() and np.isfinite(found.mu).all()
-
-
-# -- the tracker ----------------------------------------------------------------------------------
 
 
 def dived(drift=(0.0, 0.0), yaw_deg=0.0, late=0.0, **values):
