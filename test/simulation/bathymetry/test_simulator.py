@@ -74,7 +74,9 @@ def test_patch_heights_have_their_deviation_and_correlation():
     assert lag == pytest.approx(np.exp(-0.25), abs=0.05)
 
 
-def test_slope_undulation_and_drift():
+def test_slope_undulation_drift_and_shadows():
+    _, shadow = run('shadow', pings=1)[0]
+    assert shadow.valid.mean() == pytest.approx(1.0 - 8.0 / 60.0, abs=0.01)
     _, slope = run('slope')[0]
     smooth = ~slope.patch
     assert np.allclose(slope.height[smooth], 0.1 * (slope.range - 17.0)[smooth])
