@@ -74,14 +74,10 @@ def _named_columns(args: Sequence[str]) -> dict[str, str]:
     return {name: header for name, equals, header in pairs if equals}
 
 
-@click.group(
-    cls=Convert,
-    invoke_without_command=True,
-    epilog=example(
-        'sonar-imm convert usbl.csv dive.bag',
-        'sonar-imm convert fixes usbl.csv dive.bag --column x=easting --column y=northing',
-    ),
-)
+# fmt: off
+@click.group(cls=Convert, invoke_without_command=True,
+    epilog=example('sonar-imm convert usbl.csv dive.bag',
+        'sonar-imm convert fixes usbl.csv dive.bag --column x=easting --column y=northing'))
 @click.pass_context
 def command(ctx: click.Context) -> None:
     """Turn recordings in other formats into a rosbag2 bag: convert [KIND] IN OUT.
@@ -92,6 +88,7 @@ def command(ctx: click.Context) -> None:
     """
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
+# fmt: on
 
 
 def _add_subcommand(kind: str, options: type) -> None:

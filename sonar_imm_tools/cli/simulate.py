@@ -26,45 +26,26 @@ SURVEY, SURVEY_SCENES = 'survey', 'sonar_imm_tools.simulation.survey'
 """Not a system: lines of soundings over one floor."""
 
 
+# fmt: off
 @click.command(
-    epilog=example(
-        'sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
+    epilog=example('sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
         'sonar-imm simulate diver --list',
-        'sonar-imm simulate survey out --soundings --set lines=5',
-    )
-)
+        'sonar-imm simulate survey out --soundings --set lines=5'))
 @click.argument('system', type=click.Choice([*SYSTEMS, SURVEY]))
 @click.argument('out_bag', type=click.Path(path_type=Path), required=False)
 @click.option('--scenario', default=None, help='Name of the scene; by default the first one.')
-@click.option(
-    '--seed',
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help='The same scenario and seed give the same bag.',
-)
+@click.option('--seed', type=click.IntRange(min=0), default=0, show_default=True,
+    help='The same scenario and seed give the same bag.')
 @set_option
-@click.option(
-    '--soundings', is_flag=True, help='survey: folders of soundings, as `survey` reads them.'
-)
+@click.option('--soundings', is_flag=True,
+    help='survey: folders of soundings, as `survey` reads them.')
 @click.option('--compress', is_flag=True, help='Compress the bag: pressure takes a third.')
-@click.option(
-    '--list',
-    'list_scenarios',
-    is_flag=True,
-    help='Only list scenarios and what --set can change.',
-)
+@click.option('--list', 'list_scenarios', is_flag=True,
+    help='Only list scenarios and what --set can change.')
 @json_option
 def command(
-    system: str,
-    out_bag: Path | None,
-    scenario: str | None,
-    seed: int,
-    overrides: dict[str, str],
-    soundings: bool,
-    compress: bool,
-    list_scenarios: bool,
-    as_json: bool,
+    system: str, out_bag: Path | None, scenario: str | None, seed: int, overrides: dict[str, str],
+    soundings: bool, compress: bool, list_scenarios: bool, as_json: bool,
 ) -> None:
     """Write a bag of simulated measurements with their truth to OUT_BAG.
 
@@ -124,6 +105,7 @@ def command(
     say(f'{out_bag}: {what} ({name}, seed {seed}' + (f', {targets} targets)' if targets else ')'))
     if parameters:
         say(f'  parameters of the instruments, for the tracker: {parameters}')
+# fmt: on
 
 
 def _simulate_survey(

@@ -61,7 +61,7 @@ def convert_truth(path: Path, how: TruthOptions, report: ConversionReport) -> No
     values: as in `TruthOptions`.
     """
     records = _records(path, report, how.options, how.frame_id, how.origin)
-    write_bag(report.path, records, report, source=path.name, storage=how.storage)
+    write_bag(report, records, path, how)
 
 
 def truth_records(

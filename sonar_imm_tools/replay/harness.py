@@ -119,10 +119,7 @@ def run_lockstep(
                 arguments += _losing_nothing(f'{entry.makes}.publisher')
             before = stack.enter_context(
                 NodeProcess(
-                    name,
-                    domain_id=domain,
-                    arguments=arguments,
-                    module=f'sonar_imm.nodes.{name}',
+                    name, domain_id=domain, arguments=arguments, module=f'sonar_imm.nodes.{name}'
                 )
             )
             first = FirstStep(link, f'/{name}', trouble=before.trouble)
@@ -143,12 +140,7 @@ def run_lockstep(
             exit_code, log = before.stop() or exit_code, log + before.log()
         result = player.result()
         return LockstepResult(
-            recorder.estimates(),
-            lockstep.counts,
-            result.delays,
-            exit_code,
-            log,
-            result.problems,
+            recorder.estimates(), lockstep.counts, result.delays, exit_code, log, result.problems
         )
 
 
@@ -301,10 +293,7 @@ def _losing_nothing(endpoint: str) -> list[str]:
 
 
 def _arguments(
-    bag: BagReader,
-    node: str,
-    inputs: Mapping[str, InputTopic],
-    params_file: Path | str | None,
+    bag: BagReader, node: str, inputs: Mapping[str, InputTopic], params_file: Path | str | None
 ) -> list[str]:
     """Write the ROS arguments of a node that loses no input and expects the types of the bag."""
     expected: dict[str, str] = {}

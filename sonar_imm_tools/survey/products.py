@@ -61,12 +61,7 @@ OF_A_SURVEY = (*BANDS, 'cell')
 
 @contextlib.contextmanager
 def folder_of(
-    out: Path,
-    options: Options,
-    runs: Path,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
+    out: Path, options: Options, runs: Path, *, resume: bool = False, overwrite: bool = False
 ) -> Iterator[Path]:
     """Yield the folder to make a survey of `runs` in: `out` itself, or, where an earlier survey is
     replaced, a new one that takes its place at the end. Where nothing was there and the survey
@@ -263,11 +258,7 @@ def _coverage(chart: Chart, epsg: int) -> dict[str, Any]:
         geometry = transform_geom(f'EPSG:{epsg}', 'EPSG:4326', shape) if epsg else shape
         features.append({'type': 'Feature', 'properties': {}, 'geometry': geometry})
     where = 'WGS 84' if epsg else 'local metres, no coordinate system is known'
-    return {
-        'type': 'FeatureCollection',
-        'name': f'coverage in {where}',
-        'features': features,
-    }
+    return {'type': 'FeatureCollection', 'name': f'coverage in {where}', 'features': features}
 
 
 def _write_crossings(path: Path, survey: Survey) -> None:

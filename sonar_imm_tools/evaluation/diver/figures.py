@@ -85,9 +85,7 @@ def sections(
         )
     else:
         yield Section(
-            'Stated uncertainty',
-            f'One sigma on each axis.{which}',
-            sigma_figure(series, track_id),
+            'Stated uncertainty', f'One sigma on each axis.{which}', sigma_figure(series, track_id)
         )
     if series.model_names:
         yield Section(

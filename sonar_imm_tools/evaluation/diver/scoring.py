@@ -87,10 +87,7 @@ def score(
     metrics['cutoff_m'] = float(cutoff)
     metrics['scored_stamps'] = len(matching.scan_ns)
     beyond = len(matching.beyond_row)
-    metrics['beyond_cutoff'] = {
-        'n': beyond,
-        'share': beyond / max(1, beyond + len(matching.row)),
-    }
+    metrics['beyond_cutoff'] = {'n': beyond, 'share': beyond / max(1, beyond + len(matching.row))}
     metrics['position'] = error_summary(matching.distance)
     speed_error = np.hypot(*matching.error[:, 2:].T)
     metrics['velocity'] = error_summary(speed_error[np.isfinite(speed_error)], unit='mps')

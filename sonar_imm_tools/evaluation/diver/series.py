@@ -85,10 +85,7 @@ def series_of(estimates: Iterable[Estimate]) -> Series:
     if len(models) > 1:
         raise ValueError('the models change within the recording: it holds more than one run')
     series = read_rows(
-        Series,
-        estimates,
-        "the estimates have no column '{}'",
-        model_names=next(iter(models), ()),
+        Series, estimates, "the estimates have no column '{}'", model_names=next(iter(models), ())
     )
     return evolve(series, scan_ns=np.unique(series.scan_ns))
 

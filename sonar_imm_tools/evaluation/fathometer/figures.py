@@ -212,7 +212,5 @@ def _thinned(image: Image) -> Image:
     rows, columns = len(depth) // deep * deep, len(stamp) // long * long
     blocks = value[:rows, :columns].reshape(rows // deep, deep, columns // long, long)
     return Image(
-        blocks.max(axis=(1, 3)),
-        depth[:rows].reshape(-1, deep).mean(axis=1),
-        stamp[:columns:long],
+        blocks.max(axis=(1, 3)), depth[:rows].reshape(-1, deep).mean(axis=1), stamp[:columns:long]
     )

@@ -65,7 +65,7 @@ def convert_fixes(path: Path, how: FixesOptions, report: ConversionReport) -> No
 
 def write_fixes(
     table: Table, report: ConversionReport, how: FixesOptions, beside: Sequence[Record] = ()
-) -> ConversionReport:
+) -> None:
     """`convert_fixes` of a table that is open, with records `beside` its own."""
     table.require('stamp')
     polar = None
@@ -171,15 +171,9 @@ def write_fixes(
             f'{len(repeated)} rows hold a position that came before, the first in line '
             f'{repeated[0]}; the tracker leaves them out (repeat_time)'
         )
-    return write_bag(
-        report.path,
-        itertools.chain(records, truth, beside) if rows else [],
-        report,
-        source=table.path.name,
-        storage=how.storage,
-        parameters={'diver': origin_parameters(origin)},
-        streams=by_name((name if named else '', stamp) for _, stamp, _, name in read),
-    )
+    streams = by_name((name if named else '', stamp) for _, stamp, _, name in read)
+    every = itertools.chain(records, truth, beside) if rows else []
+    write_bag(report, every, table.path, how, {'diver': origin_parameters(origin)}, streams)
 
 
 def _ask_for_vessel(table: Table) -> None:

@@ -22,8 +22,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_imm.measurements import Rejection
-
 from ..conversion import ConversionReport, flags_of
 from ..conversion import Record as Stamped
 from ..csv_table import CsvTable
@@ -31,7 +29,6 @@ from ..places import ask_for_angle, Degrees, TURN
 from ..positions import write_position
 from ..sources import BagError
 from ..tables import CsvOptions, Row
-from ..times import BadRow
 from .sonar_files import Frame, navigation_messages, Record
 
 ARRAYS: dict[str, tuple[str, ...]] = {
@@ -145,15 +142,12 @@ def _messages(
 ) -> Iterator[Stamped]:
     """Yield the messages of each record; what cannot be used is counted."""
     for k, record in enumerate(records):
-        try:
+        navigation = None
+        with report.leaving_out(path, f'pose {k}'):
             navigation = frame.navigation(record)
-        except (Rejection, BadRow) as error:
-            report.bad_row(path, f'pose {k}', error)
-            continue
-        if navigation is None:
-            continue
-        for message in navigation_messages(record, navigation):
-            yield record['stamp_ns'], message.topic, message.content
+        if navigation is not None:
+            for message in navigation_messages(record, navigation):
+                yield record['stamp_ns'], message.topic, message.content
     frame.tell(path, report)
 
 

@@ -423,9 +423,7 @@ def _take_heading(log: _Log, degrees: float, roll: float = 0.0, pitch: float = 0
     angles = [math.radians(angle) for angle in (*level, 90.0 - degrees)]
     log.headings.append(
         VesselHeading(
-            stamp_ns=stamp_ns,
-            orientation=np.array(quaternion(*angles)),
-            frame_id='vessel',
+            stamp_ns=stamp_ns, orientation=np.array(quaternion(*angles)), frame_id='vessel'
         )
     )
 

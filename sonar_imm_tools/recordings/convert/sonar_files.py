@@ -143,13 +143,11 @@ def write_records(
     with BagWriter(report.path, storage=how.storage, custom_data=notes, parameters=own) as bag:
         for record in _in_time(records, path, report):
             stamp_ns = record['stamp_ns']
-            try:
+            nav, made = None, []
+            with report.leaving_out(path, record['where']):
                 nav = frame.navigation(record)
                 with np.errstate(invalid='ignore'):  # of NaN, which the measurements reject
                     made = list(messages({**record, 'nav': nav}))
-            except (Rejection, BadRow) as error:
-                report.bad_row(path, record['where'], error)
-                continue
             if made and nav is not None and stamp_ns != frame.last_ns:
                 frame.last_ns = stamp_ns
                 made = [*navigation_messages(record, nav), *made]

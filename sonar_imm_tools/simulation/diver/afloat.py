@@ -19,6 +19,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geodesy import Origin
@@ -75,7 +76,7 @@ def vessel_at(stamp_ns: int) -> tuple[FloatArray, FloatArray]:
 
 
 def sense_from_vessel(
-    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: np.random.Generator
+    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: Generator
 ) -> list[VesselPose | RelativeFix]:
     """The pose of the vessel a moment before the scan, and each diver that is heard."""
     pose_ns = stamp_ns - BEFORE_NS
@@ -108,7 +109,7 @@ def sense_from_vessel(
 
 
 def sense_geodetic(
-    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: np.random.Generator
+    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: Generator
 ) -> list[GeodeticFix]:
     """Positions with a white error, in latitude and longitude."""
     fixes = []

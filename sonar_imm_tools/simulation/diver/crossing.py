@@ -18,6 +18,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Fixes
@@ -47,7 +48,7 @@ CROSSING = (
 """The scene of `simulator.SCENARIOS`."""
 
 
-def crossing_paths(divers: int, times: FloatArray, rng: np.random.Generator) -> list[FloatArray]:
+def crossing_paths(divers: int, times: FloatArray, rng: Generator) -> list[FloatArray]:
     """States (n, 4), px py vx vy, of `divers` at `times`; with an odd number the last one swims
     as if it had met a partner."""
     paths: list[FloatArray] = []
@@ -65,9 +66,7 @@ def crossing_paths(divers: int, times: FloatArray, rng: np.random.Generator) -> 
     return paths[:divers]
 
 
-def sense_scan(
-    config: Any, stamp_ns: int, present: FloatArray, rng: np.random.Generator
-) -> list[Fixes]:
+def sense_scan(config: Any, stamp_ns: int, present: FloatArray, rng: Generator) -> list[Fixes]:
     """All fixes of one scan in no particular order: of divers at `present` (n, 3), and false ones
     in the square; config: a `DiverScenario`."""
     half, std = config.clutter_range, config.fix_std

@@ -17,6 +17,7 @@ summed up at some angles put echoes too shallow, make them weaker and leave peak
 from __future__ import annotations
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from sonar_imm.acoustics.ambient import horizontal_noise_csdm, surface_noise_csdm
@@ -52,7 +53,7 @@ def expected_csdm(
 
 
 def pressure_field(
-    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+    config: FathometerScenario, drift: Drift, record: int, rng: Generator
 ) -> NDArray[np.float32]:
     """Pressure (n, M) of one record; a two-sided spectrum of R."""
     length = round(config.record_seconds * config.sample_rate)

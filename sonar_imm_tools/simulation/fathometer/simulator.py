@@ -24,6 +24,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from sonar_imm.acoustics import fathometer
 from sonar_imm.acoustics.ambient import sample_csdm
@@ -32,6 +33,7 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from sonar_imm.truth import Received, Scene, TrueReflectors
 
+from ..scenario import FIRST_STAMP_NS
 from .field import expected_csdm, pressure_field
 from .scenario import Drift, drift_of, FathometerScenario, scenario, SCENARIOS
 
@@ -45,7 +47,6 @@ __all__ = [
     'stream',
 ]
 
-FIRST_STAMP_NS = 1_700_000_000_000_000_000
 _THRESHOLD = 3.0
 """Standard deviations of the noise below which a profiler writes zero."""
 FRAME_ID = 'array'
@@ -91,9 +92,7 @@ def stamp_of(config: FathometerScenario, record: int) -> int:
     return FIRST_STAMP_NS + round((record + 1) * config.record_seconds * 1e9)
 
 
-def _measurements(
-    config: FathometerScenario, drift: Drift, rng: np.random.Generator
-) -> Iterator[list[Any]]:
+def _measurements(config: FathometerScenario, drift: Drift, rng: Generator) -> Iterator[list[Any]]:
     """The measurements of each record."""
     for record in range(config.records):
         stated = None if config.depth_companion else float(drift.array_depth_stated[record])
@@ -116,11 +115,7 @@ def _measurements(
 
 
 def cross_spectra(
-    config: FathometerScenario,
-    drift: Drift,
-    record: int,
-    stated: float | None,
-    rng: np.random.Generator,
+    config: FathometerScenario, drift: Drift, record: int, stated: float | None, rng: Generator
 ) -> CrossSpectra:
     """A sample of the cross-spectra of one record around their expectation. stated: the depth of
     the array that the record states."""
@@ -145,7 +140,7 @@ def _depths(config: FathometerScenario) -> FloatArray:
 
 
 def _response(
-    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+    config: FathometerScenario, drift: Drift, record: int, rng: Generator
 ) -> tuple[FloatArray, float]:
     """What the processor makes of cross-spectra, and its noise."""
     spectra = cross_spectra(config, drift, record, None, rng)
@@ -164,7 +159,7 @@ def _response(
 
 
 def _pulses(
-    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+    config: FathometerScenario, drift: Drift, record: int, rng: Generator
 ) -> tuple[FloatArray, float]:
     """Pulses, and noise through the same band, with the error of the array's depth."""
     depth, step = _depths(config), config.depth_step
@@ -186,11 +181,7 @@ def _pulses(
 
 
 def pressure_blocks(
-    config: FathometerScenario,
-    drift: Drift,
-    record: int,
-    stated: float | None,
-    rng: np.random.Generator,
+    config: FathometerScenario, drift: Drift, record: int, stated: float | None, rng: Generator
 ) -> list[Pressure]:
     """The pressure of one record in blocks of `block_seconds`, the last ends with the record."""
     pressure = pressure_field(config, drift, record, rng)
@@ -216,7 +207,7 @@ def pressure_blocks(
 
 
 def _envelope(
-    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+    config: FathometerScenario, drift: Drift, record: int, rng: Generator
 ) -> tuple[FloatArray, None]:
     """The stacked envelope (n,) of one record, as a sub-bottom profiler records it over a floor
     that scatters in its volume; it says nothing of its noise.
@@ -255,6 +246,6 @@ _TRACES = {'response': _response, 'trace': _pulses, 'envelope': _envelope}
 """Level: how the amplitudes of its traces are made, and the standard deviation of their noise."""
 
 
-def _complex_noise(count: int, rng: np.random.Generator) -> FloatArray:
+def _complex_noise(count: int, rng: Generator) -> FloatArray:
     """Of unit power, (count,) complex."""
     return rng.standard_normal((count, 2)) @ np.array([1.0, 1j]) * np.sqrt(0.5)

@@ -28,6 +28,7 @@ from sonar_imm_tools.evaluation.fathometer.crossing import (
 )
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.recordings.conversion import ConversionReport, write_bag
+from sonar_imm_tools.recordings.convert_options import TracesOptions
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.own_files import write_own_parameters
 from sonar_imm_tools.recordings.positions import write_position
@@ -60,7 +61,7 @@ def line(folder, name, places, shift=0.0, positions=True, first=0, lower=None):
             records.append((stamp, '/position', write_position(stamp, *place)))
         records.append((stamp, '/trace', write_trace(trace, ros_message)))
     bag = folder / f'{name}.bag'
-    write_bag(bag, records, ConversionReport(bag), source=name)
+    write_bag(ConversionReport(bag), records, folder / name, TracesOptions())
     own = {**envelope_parameters(0.5, 0.05), 'particles': 400, 'depth_std': 0.1}
     write_own_parameters(bag, {'fathometer': own})
     assert main(['track', str(bag), str(folder / name)]) == 0
