@@ -63,7 +63,7 @@ from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.offline.tracking import InputOptions, OfflineRun, write_run
 from sonar_imm_tools.recordings.own_files import unusual
 from sonar_imm_tools.recordings.reader import BagReader
-from sonar_imm_tools.recordings.scenes import write_scene
+from sonar_imm_tools.recordings.truth import write_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 ENTRY = str(ROOT / 'benchmarks' / 'entry')

@@ -66,7 +66,7 @@ def command(
     from sonar_imm.truth import TrueTrack
 
     from ..recordings.own_files import own_parameters, unusual
-    from ..recordings.scenes import write_scene
+    from ..recordings.truth import write_scene
 
     name = scenario or next(iter(scenes.SCENARIOS))
     config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
@@ -123,8 +123,8 @@ def _simulate_survey(
 
     from ..recordings.export.points import write_table
     from ..recordings.own_files import unusual
-    from ..recordings.scenes import write_scene
     from ..recordings.sources import BagError
+    from ..recordings.truth import write_scene
 
     name = scenario or next(iter(scenes.SCENARIOS))
     config = scenes.scenario(name, typed_overrides(scenes.SurveyScenario, overrides))

@@ -14,9 +14,8 @@ import numpy as np
 from msg_adapters.estimates import read_estimate
 from sonar_imm.measurements import Fix
 from sonar_imm.truth import Received, Scene, TrueReflectors, TrueTrack, TruthTable
-from sonar_imm_tools.recordings import scenes
 from sonar_imm_tools.recordings.reader import BagReader
-from sonar_imm_tools.recordings.truth import records_of
+from sonar_imm_tools.recordings.truth import records_of, write_scene
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -35,7 +34,7 @@ def test_late_measurements_are_recorded_when_they_were_received(tmp_path):
         (Received(START_NS + 9, fix(1)), Received(START_NS + 4, fix(3))),
         (TrueTrack(7, START_NS + np.array([2, 6]), np.zeros((2, 3)), np.ones((2, 2))),),
     )
-    report = scenes.write_scene(scene, tmp_path / 'bag', provenance={})
+    report = write_scene(scene, tmp_path / 'bag', provenance={})
     assert report.messages == {'/fix': 2, '/truth/estimate': 2}
     assert logged(tmp_path / 'bag') == [
         ('/truth/estimate', 2),
@@ -54,7 +53,7 @@ def test_a_scene_may_know_other_truth_of_its_own(tmp_path):
             yield TruthTable(self.stamp_ns, frame_id, {'x': np.zeros(1, np.float32)}, 'north')
 
     scene = Scene((Received(START_NS + 1, fix(0), 'south'),), (Buoy(START_NS + 2),))
-    scenes.write_scene(scene, tmp_path / 'bag', provenance={})
+    write_scene(scene, tmp_path / 'bag', provenance={})
     assert logged(tmp_path / 'bag') == [('/south/fix', 1), ('/truth/north/estimate', 2)]
 
 

@@ -8,9 +8,9 @@
 
 """How runs of the diver tracker are judged: tracks of positions against true paths.
 
-`series` holds the estimates as flat arrays, `truth` the true paths, `matching` says which track
-belongs to which diver, `scoring` compares them. `METRICS`, `summary_sentence` and `figures`
-present the result.
+`series` holds the estimates and the true paths as flat arrays and says which track belongs to
+which diver, `scoring` compares them. `METRICS`, `summary_sentence` and `figures` present the
+result.
 """
 
 from __future__ import annotations

@@ -42,8 +42,7 @@ from ..plotting import (
     view_of,
 )
 from ..report import Section
-from .matching import match, Matching
-from .series import Series, Truth
+from .series import match, Matching, Series, Truth
 
 MOST_ELLIPSES = 60
 MOST_TRACKS_NAMED = 12

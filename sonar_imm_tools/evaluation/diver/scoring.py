@@ -44,8 +44,7 @@ from ..numbers import (
     relative_nees,
     usable_nees,
 )
-from .matching import match, Matching, track_summary
-from .series import Series, Truth
+from .series import match, Matching, Series, track_summary, Truth
 
 COVERAGE_LEVELS = (0.5, 0.9, 0.95)
 LAG_RANGE = 30.0

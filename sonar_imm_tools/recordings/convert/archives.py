@@ -41,8 +41,7 @@ from ..messages import ros_message
 from ..sources import BagError
 from ..tables import Row
 from ..truth import records_of
-from .navigation import ARRAYS, navigation_of_arrays, navigation_of_table
-from .sonar_files import Frame
+from .navigation import ARRAYS, Frame, navigation_of_arrays, navigation_of_table
 
 NAMES: dict[str, tuple[str, ...]] = {
     'iq': ('iq', 'snapshots', 'Y', 'quadrants'),

@@ -15,7 +15,12 @@ written of a scene:
     response  traces processed from such cross-spectra;
     trace     traces made directly, of pulses and noise in the same band: hundreds per second;
     envelope  of a sub-bottom profiler over a floor that scatters, see `envelope`;
-    pressure  time series drawn from the cross-spectral model (`field`): for short scenes.
+    pressure  time series drawn from the cross-spectral model: for short scenes.
+
+Pressure is drawn over a whole record: at each frequency of its own transform C n, with R = C C^H
+and n standard complex normal, and all of it transformed back. Every angle, the exact delays
+and what is lost of long lags come by themselves; plane waves summed up at some angles put echoes
+too shallow, make them weaker and leave peaks beside them.
 """
 
 from __future__ import annotations
@@ -25,16 +30,16 @@ from typing import Any
 
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 from sonar_imm.acoustics import fathometer
-from sonar_imm.acoustics.ambient import sample_csdm
+from sonar_imm.acoustics.ambient import horizontal_noise_csdm, sample_csdm, surface_noise_csdm
 from sonar_imm.acoustics.pulse import band_pulse, gaussian_pulse
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import ComplexArray, FloatArray
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from sonar_imm.truth import Received, Scene, TrueReflectors
 
 from ..scenario import FIRST_STAMP_NS
-from .field import expected_csdm, pressure_field
 from .scenario import Drift, drift_of, FathometerScenario, scenario, SCENARIOS
 
 __all__ = [
@@ -249,3 +254,47 @@ _TRACES = {'response': _response, 'trace': _pulses, 'envelope': _envelope}
 def _complex_noise(count: int, rng: Generator) -> FloatArray:
     """Of unit power, (count,) complex."""
     return rng.standard_normal((count, 2)) @ np.array([1.0, 1j]) * np.sqrt(0.5)
+
+
+_AT_ONCE = 2048
+"""Frequencies whose matrices are in memory together."""
+
+
+def expected_csdm(
+    config: FathometerScenario, drift: Drift, record: int, frequency: FloatArray
+) -> ComplexArray:
+    """R (F, M, M) of a record at `frequency` (F,) Hz."""
+    there = drift.amplitude[record] != 0.0
+    array = config.phones, config.element_spacing
+    R = surface_noise_csdm(
+        frequency,
+        *array,
+        drift.depth[record, there] - drift.array_depth[record],
+        drift.amplitude[record, there],
+        config.sound_speed,
+    )
+    passing = config.ship_pass and config.ship_pass[0] <= record <= config.ship_pass[1]
+    ships = (100.0 if passing else 1.0) * config.ship_noise / (1.0 + (frequency / 200.0) ** 2)
+    R += ships[:, None, None] * horizontal_noise_csdm(frequency, *array, 0.03, config.sound_speed)
+    R += config.phone_noise * np.eye(config.phones)
+    if not config.whitened:
+        # Surface noise is red: it falls by 5 dB per octave.
+        R *= ((frequency / 1000.0) ** -1.6)[:, None, None]
+    return R
+
+
+def pressure_field(
+    config: FathometerScenario, drift: Drift, record: int, rng: Generator
+) -> NDArray[np.float32]:
+    """Pressure (n, M) of one record; a two-sided spectrum of R."""
+    length = round(config.record_seconds * config.sample_rate)
+    frequency = np.asarray(np.fft.rfftfreq(length, 1.0 / config.sample_rate), np.float64)
+    low, high = 0.5 * config.frequency_min, 1.2 * config.frequency_max
+    inside = np.flatnonzero((frequency >= low) & (frequency <= high))
+    spectra = np.zeros((len(frequency), config.phones), np.complex64)
+    for rows in np.split(inside, range(_AT_ONCE, len(inside), _AT_ONCE)):
+        root = np.linalg.cholesky(expected_csdm(config, drift, record, frequency[rows]))
+        noise = rng.standard_normal((len(rows), config.phones, 2)) @ np.array([1.0, 1j])
+        spectra[rows] = np.sqrt(0.5) * (root @ noise[..., None])[..., 0]
+    pressure = np.fft.irfft(spectra, length, axis=0) * np.sqrt(length)
+    return pressure.astype(np.float32)

@@ -14,9 +14,8 @@ from scipy.stats import chi2, norm
 
 from sonar_imm.measurements import Fix
 from sonar_imm_tools.evaluation.diver import figures
-from sonar_imm_tools.evaluation.diver.matching import match
 from sonar_imm_tools.evaluation.diver.scoring import fix_series
-from sonar_imm_tools.evaluation.diver.series import series_of, Truth
+from sonar_imm_tools.evaluation.diver.series import match, series_of, Truth
 from sonar_imm_tools.evaluation.plotting import view_of
 
 

@@ -14,8 +14,7 @@ from helpers.dive_scenes import estimate_at, SECOND, START_NS, truth_estimate
 import numpy as np
 import pytest
 
-from sonar_imm_tools.evaluation.diver.matching import assign, match, track_summary
-from sonar_imm_tools.evaluation.diver.series import series_of, Truth
+from sonar_imm_tools.evaluation.diver.series import assign, match, series_of, track_summary, Truth
 
 FAR = 1000.0
 

@@ -18,11 +18,11 @@ from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm_tools.simulation.fathometer.field import expected_csdm
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of
 from sonar_imm_tools.simulation.fathometer.simulator import (
     _envelope,
     cross_spectra,
+    expected_csdm,
     scenario,
     SCENARIOS,
     simulate,

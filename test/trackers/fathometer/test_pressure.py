@@ -29,9 +29,8 @@ from sonar_imm.trackers.fathometer.response import (
     processor_pulse,
     pulse_of,
 )
-from sonar_imm_tools.simulation.fathometer.field import expected_csdm
 from sonar_imm_tools.simulation.fathometer.scenario import Drift
-from sonar_imm_tools.simulation.fathometer.simulator import scenario
+from sonar_imm_tools.simulation.fathometer.simulator import expected_csdm, scenario
 
 VECTORS = Path(__file__).parents[2] / 'vectors'
 SHORT = {
