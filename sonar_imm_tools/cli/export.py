@@ -18,7 +18,7 @@ import click
 
 from sonar_imm.files import whole
 
-from .common import example, json_option, place_options, print_json, say
+from .common import crs_option, example, json_option, origin_option, print_json, say
 
 FORMATS = ('xyz', 'las', 'laz', 'tif')
 HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
@@ -35,7 +35,8 @@ TRACK_FORMATS = ('gpx', 'kml', 'geojson', 'csv', 'parquet')
         'sonar-imm export out map.geojson --map --epsg 32632 --origin 500000,6000000'))
 @click.argument('run', type=click.Path(path_type=Path, file_okay=False))
 @click.argument('out', type=click.Path(path_type=Path, dir_okay=False))
-@place_options
+@crs_option
+@origin_option
 @click.option('--cell', type=click.FloatRange(min=0.0, min_open=True), default=1.0,
     show_default=True, help='Side of the cells of a grid, in metres.')
 @click.option('--segy', 'original', type=click.Path(path_type=Path, exists=True, dir_okay=False),

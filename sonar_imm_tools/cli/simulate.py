@@ -20,7 +20,7 @@ from msg_adapters.inputs import FEEDERS
 from sonar_imm import __version__
 from sonar_imm.trackers import SYSTEMS
 
-from .common import example, json_option, print_json, say, set_option, typed_overrides
+from .common import by_topic, example, json_option, print_json, say, set_option, typed_overrides
 
 SURVEY, SURVEY_SCENES = 'survey', 'sonar_imm_tools.simulation.survey'
 """Not a system: lines of soundings over one floor."""
@@ -101,7 +101,7 @@ def command(
     if as_json:
         print_json(result)
         return
-    what = ', '.join(f'{count} on {topic}' for topic, count in sorted(report.messages.items()))
+    what = by_topic(report.messages)
     say(f'{out_bag}: {what} ({name}, seed {seed}' + (f', {targets} targets)' if targets else ')'))
     if parameters:
         say(f'  parameters of the instruments, for the tracker: {parameters}')

@@ -17,7 +17,17 @@ from pathlib import Path
 import click
 
 from ..evaluation.numbers import counted
-from .common import example, json_option, place_options, print_json, progress, say, warn
+from .common import (
+    crs_option,
+    example,
+    jobs_option,
+    json_option,
+    origin_option,
+    print_json,
+    progress,
+    say,
+    warn,
+)
 
 
 def _resolution(_ctx: click.Context, _param: click.Parameter, value: str) -> float:
@@ -43,9 +53,9 @@ def _resolution(_ctx: click.Context, _param: click.Parameter, value: str) -> flo
     metavar='auto|M', help='Side of the cells in metres; auto: a twentieth of the depth, by tile.')
 @click.option('--adjust', 'adjusted', is_flag=True, help='Adjust the lines where they cross.')
 @click.option('--fix', 'fixed', metavar='LINE', multiple=True, help='A line whose tide is known.')
-@place_options
-@click.option('--jobs', type=click.IntRange(min=1), default=1, show_default=True,
-    help='Processes.')
+@crs_option
+@origin_option
+@jobs_option(help='Processes.')
 @click.option('--scheduler', metavar='ADDRESS',
     help='Do the jobs on the cluster of this dask scheduler instead; its workers need the same '
     'sonar_imm, and reach RUNS and OUT by the same paths.')

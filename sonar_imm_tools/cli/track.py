@@ -24,6 +24,7 @@ from sonar_imm.trackers import System, SYSTEMS
 from .common import (
     BAG,
     example,
+    jobs_option,
     json_option,
     load_config,
     load_detector,
@@ -84,7 +85,7 @@ def _shard(
     help='Where divers are at first, as the topic initial says it: YAML or JSON with position and '
     'covariance, and if wanted name, time, frame_id.')
 @click.option('--smooth', is_flag=True, help='Condition each estimate on later measurements too.')
-@click.option('--jobs', type=click.IntRange(min=1), default=1, show_default=True,
+@jobs_option(
     help='Processes: for several runs, or for the pings of one where no ping needs another '
     '(bathymetry). The estimates do not depend on it.')
 @click.option('--scheduler', metavar='ADDRESS',
@@ -214,7 +215,8 @@ class Plan:
         from ..recordings.reader import BagReader
         from ..recordings.topics import instruments, remarks_on_topics
 
-        wanted = inputs_by_topic(self.topics)
+        # Input by topic name; None to choose by name.
+        wanted = {topic: name for name, topic in self.topics.items()} or None
         with BagReader(bag, strict=self.strict) as reader:
             system = choose_system(reader, self.system, wanted)
             found = instruments(reader, system.name, wanted)
@@ -334,11 +336,6 @@ def _track_all(
     print_json(content) if as_json else _print_summary(content, out_dir)
     if any(outcome.failure for outcome in outcomes):
         raise click.exceptions.Exit(1)
-
-
-def inputs_by_topic(topics: dict[str, str]) -> dict[str, str] | None:
-    """``--topic`` as `recordings` takes it: input by topic name, None to choose by name."""
-    return {topic: name for name, topic in topics.items()} or None
 
 
 def choose_system(

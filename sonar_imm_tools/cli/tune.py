@@ -21,6 +21,7 @@ import click
 from .common import (
     BAG,
     example,
+    jobs_option,
     json_option,
     params_option,
     print_json,
@@ -51,8 +52,7 @@ if TYPE_CHECKING:
 @params_option('Parameter file to begin with: ROS 2 form or a plain mapping.')
 @set_option
 @topic_option
-@click.option('--jobs', type=click.IntRange(min=1), default=1, show_default=True,
-    help='Processes that share the fits. The result does not depend on it.')
+@jobs_option(help='Processes that share the fits. The result does not depend on it.')
 @json_option
 def command(
     bags: tuple[Path, ...], parameters: str | None, out: Path | None, jobs: int, as_json: bool,

@@ -262,28 +262,17 @@ def _swept(domain_id: int) -> bool:
     return not living
 
 
-def local_discovery() -> contextlib.AbstractContextManager[None]:
-    """Let what is started meanwhile, nodes and links, find others on this machine only."""
-    return _environment(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOCALHOST_ONLY=None)
-
-
 @contextlib.contextmanager
-def _environment(**values: str | None) -> Iterator[None]:
-    """Set environment variables for a while; None unsets."""
-    before = {name: os.environ.get(name) for name in values}
-    _set_environment(values)
+def local_discovery() -> Iterator[None]:
+    """Let what is started meanwhile, nodes and links, find others on this machine only."""
+    names = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY'
+    before = {name: os.environ.pop(name) for name in names if name in os.environ}
+    os.environ[names[0]] = 'LOCALHOST'
     try:
         yield
     finally:
-        _set_environment(before)
-
-
-def _set_environment(values: Mapping[str, str | None]) -> None:
-    for name, value in values.items():
-        if value is None:
-            os.environ.pop(name, None)
-        else:
-            os.environ[name] = value
+        os.environ.pop(names[0], None)
+        os.environ.update(before)
 
 
 def _losing_nothing(endpoint: str) -> list[str]:

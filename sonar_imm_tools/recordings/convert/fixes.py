@@ -69,7 +69,8 @@ def write_fixes(
     """`convert_fixes` of a table that is open, with records `beside` its own."""
     table.require('stamp')
     polar = None
-    if table.has('range', 'bearing') and not _has_places(table):
+    placed = table.has('x', 'y') or table.has('latitude', 'longitude')
+    if table.has('range', 'bearing') and not placed:
         if how.bearings == 'bow':
             raise BagError(
                 f'{table.path}: bearings from the bow need the pose of the vessel; see '
@@ -217,10 +218,6 @@ def _may_be_of_vessel(table: Table) -> bool:
     vessel = any(table.has(name) for name in ('vessel_x', 'vessel_latitude'))
     ranks = [rank_of(name, table.header(name)) for name in names]
     return not vessel and min(ranks) >= 0 and not set(names) & set(table.options.columns)
-
-
-def _has_places(table: Table) -> bool:
-    return table.has('x', 'y') or table.has('latitude', 'longitude')
 
 
 def _shared(stamps: Sequence[int]) -> str:

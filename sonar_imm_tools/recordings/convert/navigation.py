@@ -90,10 +90,12 @@ class Frame:
             value if math.isfinite(value) else 0.0
             for value in (record['depth'], record['pitch'], record['roll'])
         )
+        # ENU from FLU, of degrees from north to the east, bow up, starboard down.
+        angles = roll, -pitch, 90.0 - record['heading']
         return Navigation(
             stamp_ns=record['stamp_ns'],
             position=[east, north, -depth],
-            orientation=_orientation(record['heading'], pitch, roll),
+            orientation=quaternion(*map(math.radians, angles)),
             frame_id=self.frame_id,
         )
 
@@ -113,12 +115,6 @@ class Frame:
         self.leaps.tell(path, report)
         if place := self.origin:
             report.notes['origin'] = f'latitude {place.latitude!r}, longitude {place.longitude!r}'
-
-
-def _orientation(heading: float, pitch: float, roll: float) -> tuple[float, float, float, float]:
-    """Quaternion x, y, z, w, ENU from FLU, of degrees: from north to the east, bow up, starboard
-    down."""
-    return quaternion(math.radians(roll), math.radians(-pitch), math.radians(90.0 - heading))
 
 
 def ground_message(ping: Record, offset: np.ndarray) -> Message:

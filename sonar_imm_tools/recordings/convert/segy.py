@@ -209,22 +209,13 @@ def measured_instrument(
     """Standard deviation of the pulse, m, and noise (n,), rms, of envelopes (T, n) with samples
     `spacing` m apart, of which `stack` successive ones are averaged; None when too few traces have
     a floor that stands free."""
-    tables = measure_line(_stretches(_stacked(amplitude, stack)), spacing)
+    T = len(amplitude) // stack
+    stacked = amplitude[: T * stack].reshape(T, stack, -1).mean(axis=1)
+    if T > _RUNS * _RUN:  # some stretches of successive traces, all along the line
+        begin = np.linspace(0, T - _RUN, _RUNS).astype(np.int64)
+        stacked = stacked[(begin[:, None] + np.arange(_RUN)).ravel()]
+    tables = measure_line(stacked, spacing)
     return (spacing * tables.pulse, tables.noise) if tables.pulse > 0.0 else None
-
-
-def _stretches(amplitude: FloatArray) -> FloatArray:
-    """Of many traces (T, n) some stretches of successive ones, all along the line."""
-    T = len(amplitude)
-    if T <= _RUNS * _RUN:
-        return amplitude
-    begin = np.linspace(0, T - _RUN, _RUNS).astype(np.int64)
-    return amplitude[(begin[:, None] + np.arange(_RUN)).ravel()]
-
-
-def _stacked(amplitude: FloatArray, stack: int) -> FloatArray:
-    count = len(amplitude) // stack
-    return np.asarray(amplitude[: count * stack].reshape(count, stack, -1).mean(axis=1))
 
 
 def doubted_spacing(
