@@ -51,9 +51,7 @@ FUZZ_JSON ?=
 FILES ?= 100
 STATES ?= 25000
 # Tests that run the compiled kernels.
-KERNEL_TESTS := test/estimation/test_set_particles.py \
-    $(addprefix test/acoustics/test_,$(addsuffix .py,laplace interference coherence)) \
-    test/trackers
+KERNEL_TESTS := test/estimation/test_set_particles.py test/acoustics/test_laplace.py test/trackers
 
 # The environment stands alone: a sourced ROS 2 would mix its libraries with those of the wheels. And
 # Python keeps what it has compiled of the sources: else each process compiles them anew, for seconds.

@@ -18,13 +18,12 @@ common to a ping, so that closer pings would judge one error many times.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.bathymetry_paper import truth_of, WALKS
-from benchmarks.study import known, Parts, study
+from benchmarks.study import Parts, study
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, profiles_of
 from sonar_imm_tools.evaluation.bathymetry.scoring import score
@@ -116,22 +115,12 @@ def _rmse(profile: Profile) -> float:
     return float(np.sqrt(np.nanmean(np.square(error))))
 
 
-def main(
-    pings: int = 24, seed: int = 1, only: str = '', keep: bool = False, out: Path | None = None
-) -> Parts:
-    settings = {'pings': pings, 'seed': seed}
-    before = known(out) if keep else {}
-    if before and {name: before[name] for name in settings} != settings:
-        raise SystemExit('the file is of another run')
-    yield {**settings, 'cases': before.get('cases', {})}
+def main(pings: int = 24, seed: int = 1, only: str = '') -> Parts:
+    yield {'pings': pings, 'seed': seed}
     for name in CASES:
         if name.startswith(only):
             yield {'cases': {name: run(name, pings, seed)}}
 
 
 if __name__ == '__main__':
-    study(
-        main,
-        only={'help': 'cases whose name begins so'},
-        keep={'help': 'keep what is in --out beside them'},
-    )
+    study(main, only={'help': 'cases whose name begins so'})

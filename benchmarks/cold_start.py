@@ -43,10 +43,6 @@ class Case:
 
 
 CASES = {
-    'diver, fixes': Case('diver', ('Fix',)),
-    'diver, fixes, gnn': Case('diver', ('Fix',), {'association': 'gnn'}),
-    'diver, arrivals': Case('diver', ('Arrivals',)),
-    'diver, everything': Case('diver', (), {'dimensions': 3}),
     'bathymetry, defaults': Case('bathymetry', ('Snapshot',)),
     'bathymetry, with navigation': Case(
         'bathymetry', ('Snapshot', 'Navigation'), {'navigation': 'required'}

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.study import final_estimates, Parts, study, truths
+from benchmarks.study import final_estimates, first_track, Parts, study, truths
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import TrueTrack
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
@@ -41,13 +41,13 @@ def whole_tracker(runs: int, **values: Any) -> dict[str, dict[str, float]]:
             at = {int(stamp): k for k, stamp in enumerate(path.stamp_ns)}
             ids = set()
             for stamp, estimate in final.items():
-                rows = np.flatnonzero(estimate.extras['track_state'] > 0)
+                found = first_track(estimate, path.position[at[stamp], :2])
                 total += 1
-                absent += not len(rows)
-                for row in rows[:1]:
-                    ids.add(int(estimate.extras['track_id'][row]))
-                    error = estimate.state[row, :2] - path.position[at[stamp], :2]
-                    squared.append(error @ error)
+                absent += found is None
+                if found is not None:
+                    confirmed = estimate.extras['track_state'] > 0
+                    ids.add(int(estimate.extras['track_id'][confirmed][0]))
+                    squared.append(found[0] @ found[0])
             names.append(len(ids))
         table[name] = {
             'RMSE': float(np.sqrt(np.mean(squared))),

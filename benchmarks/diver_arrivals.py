@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.diver_families import INSIDE
-from benchmarks.study import final_estimates, Parts, study, truths
+from benchmarks.study import final_estimates, first_track, Parts, study, truths
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
@@ -96,10 +96,9 @@ def followed(pings: list[Arrivals], track: TrueTrack, **values: Any) -> Score:
     rows: list[tuple[float, float, float]] = []
     tracker = DiverTracker(DiverConfig(**values))
     for stamp, estimate in sorted(final_estimates(tracker, pings).items()):
-        for row in np.flatnonzero(estimate.extras['track_state'] > 0)[:1]:
-            error = estimate.state[row, :2] - track.position[at[stamp], :2]
-            nees = error @ np.linalg.solve(estimate.covariance[row, :2, :2], error)
-            rows.append((at[stamp], float(error @ error), float(nees)))
+        if (found := first_track(estimate, track.position[at[stamp], :2])) is not None:
+            error, nees = found
+            rows.append((at[stamp], float(error @ error), nees))
     return Score(*np.reshape(rows, (-1, 3)).T)
 
 

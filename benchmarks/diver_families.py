@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.recordings import DATA
-from benchmarks.study import final_estimates, Parts, rms, study
+from benchmarks.study import final_estimates, first_track, Parts, rms, study
 from sonar_imm.measurements import Fix
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
@@ -256,12 +256,8 @@ def followed(
     final = final_estimates(tracker, fixes_of(path, factor))
     error, squared = np.full((len(path.t), 2), np.nan), np.full(len(path.t), np.nan)
     for row, stamp in enumerate(sorted(final)):
-        each = final[stamp]
-        firm = np.flatnonzero(each.extras['track_state'] > 0)
-        if len(firm):
-            error[row] = each.state[firm[0], :2] - path.truth[row]
-            P = each.covariance[firm[0], :2, :2]
-            squared[row] = error[row] @ np.linalg.solve(P, error[row])
+        if (found := first_track(final[stamp], path.truth[row])) is not None:
+            error[row], squared[row] = found
     return error, squared, tracker
 
 

@@ -34,13 +34,6 @@ runs in which the warning of the scene stands at the end; `other`: mean number o
 - `scans`: fixes of .7 m, two or five false ones in a square of 120 m. `kept`: share of runs in
   which the first target keeps its number. In `new diver`, the first target is missed two or four
   times while another one appears 10 to 30 m away.
-- `polled`: two or three divers seen one after the other, each fix with a stamp of its own and
-  nothing configured. `false`: share of scans with a confirmed track that is near none of them.
-- `existence`: four divers, .7 m, and 2 or 10 false fixes a scan in a square of 160 m, all there
-  from the start. Of tracks that are published with an existence near .6, .82 and .95: the share of
-  which a diver is near, within 3 m and what he swims from scan to scan. Brier: the mean square of
-  existence less what is true, over all published rows. `delay s`: until half of the divers have a
-  confirmed track near them.
 """
 
 from __future__ import annotations
@@ -54,7 +47,7 @@ import zlib
 import numpy as np
 
 from benchmarks.diver_families import INSIDE, integrated, legs, smooth_turns
-from benchmarks.study import mean_of, Parts, study
+from benchmarks.study import first_track, mean_of, Parts, study
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Fix, Fixes
@@ -63,10 +56,6 @@ from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 SECOND = 10**9
 COUNT, FIRST = 200, 10
 P_DETECTION = 0.9
-NEAR = 3.0
-"""Metres from a diver within which a track is his, and what he swims between scans."""
-SAID = {'.6': (0.5, 0.7), '.82': (0.7, 0.9), '.95': (0.9, 0.98)}
-"""Bins of the stated existence."""
 
 # -- one target ----------------------------------------------------------------------------------
 
@@ -245,11 +234,9 @@ def followed(scene: Scene, seed: int) -> dict[str, float]:
     for k, item in enumerate(items):
         last = tracker.process(item)[-1]
         rows += len(tracker._stream.state.rows)
-        firm = np.flatnonzero(last.extras['track_state'] > 0)
-        if k >= FIRST and len(firm):
-            error = last.state[firm[0], :2] - truth[k]
-            square.append(error @ error)
-            nees.append(error @ np.linalg.solve(last.covariance[firm[0], :2, :2], error))
+        if k >= FIRST and (found := first_track(last, truth[k])) is not None:
+            square.append(found[0] @ found[0])
+            nees.append(found[1])
     spent, said = time.process_time() - start, tracker.warnings()
     words = BURST if scene.warning == 'taken for' else (scene.warning,)
     due = [bool(scene.warning) and any(word in text for word in words) for text in said]
@@ -296,27 +283,24 @@ DIVERS = Kind({}, 0.7, 0.75, 60.0, 3.0, 8.0)
 CASES = 'clean', 'reflections', 'burst', 'crossing', 'new diver 2', 'new diver 4'
 
 
-def courses(
-    rng: np.random.Generator, count: int, targets: int, dt: float, kind: Kind
-) -> FloatArray:
-    """Places (count, targets, 2): legs of a minute, back towards the middle near an edge."""
+def courses(rng: np.random.Generator, targets: int, kind: Kind) -> FloatArray:
+    """Places (COUNT, targets, 2): legs of a minute, back towards the middle near an edge."""
     place = rng.uniform(-0.6, 0.6, (targets, 2)) * kind.half
     course = rng.uniform(-np.pi, np.pi, targets)
-    found = np.empty((count, targets, 2))
-    for k in range(count):
+    found = np.empty((COUNT, targets, 2))
+    for k in range(COUNT):
         found[k] = place
-        turns = rng.uniform(size=targets) < dt / 60.0
+        turns = rng.uniform(size=targets) < 1.0 / 60.0
         course = np.where(turns, course + rng.uniform(-1.5, 1.5, targets), course)
         out = np.abs(place).max(axis=1) > 0.9 * kind.half
         course = np.where(out, np.arctan2(-place[:, 1], -place[:, 0]), course)
-        place = place + kind.speed * dt * np.column_stack([np.cos(course), np.sin(course)])
+        place = place + kind.speed * np.column_stack([np.cos(course), np.sin(course)])
     return found
 
 
 def scans_of(
     rng: np.random.Generator,
     shown: FloatArray,
-    dt: float,
     kind: Kind,
     false: Callable[[], FloatArray],
 ) -> list[Fixes]:
@@ -329,9 +313,7 @@ def scans_of(
         z = rng.permutation(z)
         covariance = np.tile(kind.std**2 * np.eye(2), (len(z), 1, 1))
         position = np.column_stack([z, np.zeros(len(z))])
-        scans.append(
-            Fixes(stamp_ns=round(k * dt * SECOND), position=position, covariance=covariance)
-        )
+        scans.append(Fixes(stamp_ns=k * SECOND, position=position, covariance=covariance))
     return scans
 
 
@@ -382,16 +364,16 @@ def judged(
 def clumps(seed: int, kind: Kind, clean: bool = False) -> dict[str, float]:
     """GOSPA of targets among clumps of false fixes."""
     rng = np.random.default_rng([47, seed])
-    truth = courses(rng, COUNT, 3, 1.0, kind)
+    truth = courses(rng, 3, kind)
     none = np.empty((0, 2))
-    scans = scans_of(rng, truth, 1.0, kind, (lambda: none) if clean else clumped(rng, kind))
+    scans = scans_of(rng, truth, kind, (lambda: none) if clean else clumped(rng, kind))
     return judged(scans, truth, kind)[0]
 
 
 def swimmers(rng: np.random.Generator, case: str) -> FloatArray:
     """Positions (COUNT, T, 2) of the targets, NaN before one is there."""
     count = {'burst': 3, 'clean': 2, 'crossing': 2}.get(case, 1)
-    truth = courses(rng, COUNT, count, 1.0, DIVERS)
+    truth = courses(rng, count, DIVERS)
     if case == 'crossing':
         truth[:, 1] += truth[0, 0] + [3.0, 0.0] - truth[0, 1]
     if case.startswith('new diver'):
@@ -415,7 +397,7 @@ def identity(seed: int, case: str, false: float) -> dict[str, float]:
             seen[k : k + 12, 0] += turned(rng, 25.0, 25.0)
     if case.startswith('new diver'):
         seen[80 : 80 + int(case[-1]), 0] = np.nan
-    scans = scans_of(rng, seen, 1.0, DIVERS, uniform(rng, false, DIVERS.half))
+    scans = scans_of(rng, seen, DIVERS, uniform(rng, false, DIVERS.half))
     row, shown = judged(scans, truth, DIVERS)
     near = [
         int(ids[apart.argmin()]) if len(ids) and apart.min() < 4.0 else -1
@@ -426,66 +408,6 @@ def identity(seed: int, case: str, false: float) -> dict[str, float]:
         next((each for each in order if each >= 0), -1) for order in (near[29::-1], near[::-1])
     )
     return {**row, 'kept': float(first == last)}
-
-
-def polled(seed: int, targets: int) -> dict[str, float]:
-    """Confirmed tracks that are near none of the divers, whom a sensor sees one after the other,
-    one a second."""
-    rng = np.random.default_rng([49, seed])
-    truth = courses(rng, COUNT, targets, 1.0, DIVERS)
-    shown = np.full((COUNT, 1, 2), np.nan)
-    for k in range(COUNT):
-        shown[k, 0] = truth[k, k % targets]
-    none = np.empty((0, 2))
-    scans = scans_of(rng, shown, 1.0, DIVERS, lambda: none)
-    tracker, false, found = DiverTracker(DiverConfig()), 0, 0
-    for scan, places in zip(scans, truth):
-        if not len(scan.position):
-            continue
-        fix = Fix(
-            stamp_ns=scan.stamp_ns,
-            position=scan.position[0],
-            covariance=np.diag([DIVERS.std**2] * 2 + [np.nan]),
-        )
-        estimate = tracker.process(fix)[-1]
-        firm = estimate.extras['track_state'] > 0
-        apart = np.hypot(*np.moveaxis(estimate.state[firm, None, :2] - places, -1, 0))
-        away = (apart > NEAR + DIVERS.speed * targets).all(axis=1)
-        false, found = false + bool(away.any()), found + int((~away).sum())
-    return {'false': false / COUNT, 'found': found / COUNT / targets}
-
-
-def existence(seed: int, dt: float, mean: float) -> dict[str, FloatArray]:
-    """Sums over published tracks: stated existence, what is true, squares, and delays."""
-    rng = np.random.default_rng([48, seed])
-    kind = DIVERS._replace(half=80.0)
-    count = 60 if dt >= 1.0 else 300
-    truth = courses(rng, count, 4, dt, kind)
-    scans = scans_of(rng, truth, dt, kind, uniform(rng, mean, kind.half))
-    tracker, stated, true = DiverTracker(DiverConfig()), [], []
-    since, near = np.full(truth.shape[1], np.nan), NEAR + kind.speed * dt
-    for k, (scan, places) in enumerate(zip(scans, truth)):
-        (estimate,) = tracker.process(scan)
-        apart = np.hypot(*np.moveaxis(estimate.state[:, None, :2] - places, -1, 0))
-        stated += estimate.extras['existence'].tolist()
-        true += (apart < near).any(axis=1).tolist()
-        shown = (apart < near)[estimate.extras['track_state'] > 0].any(axis=0)
-        since = np.where(np.isnan(since) & shown, k * dt, since)
-    return {'stated': np.array(stated), 'true': np.array(true, float), 'delay': since}
-
-
-def reliability(dt: float, mean: float, seeds: range) -> dict[str, float | None]:
-    """How often what is said to exist does."""
-    each = [existence(seed, dt, mean) for seed in seeds]
-    stated, true, delay = (
-        np.concatenate([found[name] for found in each]) for name in ('stated', 'true', 'delay')
-    )
-    row: dict[str, float | None] = {}
-    for name, (low, high) in SAID.items():
-        within = (stated >= low) & (stated < high)
-        row[name] = float(true[within].mean()) if within.sum() >= 20 else None
-    brier = float(np.square(stated - true).mean())
-    return {**row, 'Brier': brier, 'delay s': float(np.nanmedian(delay))}
 
 
 def averaged(run: Callable[..., Mapping[str, float]], *arguments: Any) -> Callable[..., Any]:
@@ -519,12 +441,6 @@ SCENES: dict[str, dict[str, Callable[[range], Mapping[str, Any]]]] = {
     'clean': {
         f'{target}, {MANY} times the runs': partial(many_clean, target)
         for target in ('diver', 'rov', 'slow boat')
-    },
-    'polled': {f'{targets} divers': averaged(polled, targets) for targets in (2, 3)},
-    'existence': {
-        f'{dt:g} s, {mean:g} false': partial(reliability, dt, mean)
-        for dt in (0.1, 1.0, 5.0)
-        for mean in (2.0, 10.0)
     },
 }
 NAMES = tuple(name for scenes in SCENES.values() for name in scenes)

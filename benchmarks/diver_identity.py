@@ -22,14 +22,11 @@ In `untold` nothing is configured, in `table` the detection probability, the den
 and the speed of the boats (`--told`). Counted are confirmed tracks: GOSPA (10 m, 2; of boats
 20 m), `with switches` half of the cutoff for each identity switch; switches and false tracks for
 each hour. An identity is kept where both divers of a pair have the same track in scans 90 to 97 as
-in scans 32 to 39. `named m` is the error of the rows with a name against the diver of that name in
-the last minute; `clutter` the density of false fixes that was learnt at the end, over the true
-one. CPU of a scan is that of this process.
+in scans 32 to 39. CPU of a scan is that of this process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 import time
 from typing import Any
 
@@ -128,21 +125,6 @@ def measured(truth: tuple[TrueTrack, ...], seed: int) -> list[Fix | Fixes]:
     return measurements
 
 
-def named_errors(made: Iterable[Estimate], truth: Iterable[TrueTrack]) -> list[float]:
-    """Errors in m of the rows with a name, against the diver of that name."""
-    paths = {path.track_id: path for path in truth}
-    error = []
-    for estimate in made:
-        for row in np.flatnonzero(estimate.extras['target_id'] >= 0):
-            own = paths[int(estimate.extras['target_id'][row])]
-            at = [
-                np.interp(estimate.stamp_ns, own.stamp_ns, own.position[:, axis])
-                for axis in (0, 1)
-            ]
-            error.append(float(np.hypot(*(estimate.state[row, :2] - at))))
-    return error
-
-
 def scene_of(name: str, seed: int) -> tuple[list[Any], Scene, dict[str, Any], float]:
     """The measurements, the truth, what the tracker is told, and the cutoff of GOSPA in m."""
     if name == 'buddies':
@@ -184,14 +166,11 @@ def scene_of(name: str, seed: int) -> tuple[list[Any], Scene, dict[str, Any], fl
 
 def case(name: str, runs: int, nothing_stated: bool = False, **settings: Any) -> dict[str, Any]:
     """The scores of a way to pair, over all runs of a scene."""
-    learnt: list[float] = []
     scored: list[dict[str, Any]] = []
     kept: list[bool] = []
-    named: list[float] = []
     seconds, scans, rows, span = 0.0, 0, 0, 0.0
     for seed in range(runs):
         items, scene, stated, cutoff = scene_of(name, seed)
-        density = stated['clutter_density']
         tracker = DiverTracker(DiverConfig(**({} if nothing_stated else stated) | settings))
         if not seed:
             tracker.warm()
@@ -201,16 +180,9 @@ def case(name: str, runs: int, nothing_stated: bool = False, **settings: Any) ->
             made.append(tracker.process(item)[-1])
             rows = max(rows, len(tracker._stream.state.life))
         seconds, scans = seconds + time.process_time() - begin, scans + len(items)
-        if settings['association'] != 'gnn':
-            learnt += [
-                found.density / density
-                for _, found in tracker._stream.state.memory['clutter'].by_sensor
-            ]
         series, truth = series_of(made), true_paths(scene)
         scored.append(score(series, truth, cutoff=cutoff))
         span += scored[-1]['span_s']
-        late = made[-1].stamp_ns - 60 * 10**9
-        named += named_errors((e for e in made if e.stamp_ns >= late), truths(scene, TrueTrack))
         if name == 'crossing':
             kept += identities_kept(series, truth)
 
@@ -230,10 +202,8 @@ def case(name: str, runs: int, nothing_stated: bool = False, **settings: Any) ->
         'NEES': mean('consistency', 'nees_position', 'mean'),
         'false tracks/h': sum(each['false_tracks'] for each in tracks) / span * HOUR,
         'identities kept': float(np.mean(kept)) if kept else None,
-        'named m': rms(named) if named else None,
         'ms a scan': 1e3 * seconds / scans,
         'rows at most': rows,
-        'clutter': float(np.mean(learnt)) if learnt else None,
     }
 
 

@@ -16,20 +16,14 @@ The filters with one direction are tuned on scenes of their own (other seeds). R
 stamps from the first fix on.
 
 The model sets to compare with are registered as those of any package are (docs/howto/own_model.md,
-`benchmarks/entry`), under the names `bench_cv`, `bench_cv_cv`, `bench_cv_ct`,
-`bench_world_headings`, `bench_relative_headings` and `bench_heading_speed_lateral`; other studies
-run the whole tracker with them. With ``u_j`` the heading of model j and ``w_j`` its left normal:
+`benchmarks/entry`), under the names `bench_cv`, `bench_cv_cv`, `bench_cv_ct` and
+`bench_world_headings`; other studies run the whole tracker with them:
 
 cv, cv_cv, cv_ct
     One direction: white-noise acceleration (`acceleration_noise`), quiet and lively, or with
     turns.
 world_headings
-    Closest to the paper: v is drawn afresh around s u_j, the speed s given.
-relative_headings
-    v' = R(a_j) v, p += dt v': model j turns by a_j once; model 0 goes straight. An event has no
-    rate, so this set is meant for steps of a second.
-heading_speed_lateral
-    `heading_speed` with a speed along w_j that fades (Ornstein-Uhlenbeck).
+    Closest to the paper: v is drawn afresh along the heading of each model, the speed given.
 """
 
 from __future__ import annotations
@@ -38,7 +32,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-from attrs import evolve
 import numpy as np
 
 from benchmarks.study import Parts, study, truths
@@ -139,68 +132,6 @@ class WorldHeadings(OwnSet):
         self.start = velocities(config)
 
 
-class RelativeHeadings(OwnSet):
-    """Turns as events: all rows of the chain are alike. noise: of the velocity, m/s, over a
-    reference step."""
-
-    noise = 0.1
-
-    def __init__(self, config: DiverConfig):
-        u, w, _ = heading_vectors(config)
-        M, rate = len(u), self.noise**2 / config.reference_step
-
-        def step(R: FloatArray, x: FloatArray, dt: float) -> Motion:
-            F = np.eye(4)
-            F[:2, 2:], F[2:, 2:] = dt * R, R
-            return Motion(F, motion.white_acceleration(rate, 0.0, dt), np.zeros(4))
-
-        self.models = [
-            moving(f'turn_{360 * j // M:03d}', partial(step, np.column_stack([u[j], w[j]])))
-            for j in range(M)
-        ]
-        self.transition = np.tile(persistent(config)[0], (M, 1))
-        self.start = velocities(config)
-
-
-class LateralHeadings(OwnSet):
-    """The lateral speed has a standard deviation `std`, m/s, and lasts for `time` seconds."""
-
-    std, time = 0.2, 10.0
-
-    def __init__(self, config: DiverConfig):
-        plain = evolve(config, transition_matrix=(), initial_probabilities=(), **HEADINGS)
-        base = build_models(evolve(plain, dimensions=2, fix_bias_std=0.0))
-
-        def step(j: int, x: FloatArray, dt: float) -> Motion:
-            small, ux, uy = base.motion(dt), *base.E[j, 2:, 2]
-            across = np.array([-uy, ux])
-            square = np.outer(across, across)
-            F, Q = np.zeros((4, 4)), np.zeros((4, 4))
-            F[:3, :3], Q[:3, :3] = small.F[j], small.Q[j]
-            variance, fade = self.std**2, self.time
-            keep = np.exp(-dt / fade)
-            reach = fade * (1.0 - keep)
-            F[3, 3] = keep
-            F[:2, 3] = reach * across
-            spread = fade * dt - 2.0 * fade * reach + 0.5 * fade**2 * (1.0 - keep**2)
-            Q[:2, :2] += 2.0 * variance * spread * square
-            Q[:2, 3] = Q[3, :2] = variance * fade * (1.0 - keep) ** 2 * across
-            Q[3, 3] = variance * (1.0 - keep**2)
-            return Motion(F, Q, np.zeros(4))
-
-        self.models = []
-        for j, name in enumerate(base.names):
-            ux, uy = base.E[j, 2:, 2]
-            outputs = {'vx': (0.0, 0.0, ux, -uy), 'vy': (0.0, 0.0, uy, ux)}
-            states = 'px', 'py', 'speed', 'lateral_speed'
-            self.models.append(Model(name, states, partial(step, j), outputs))
-        self.transition = base.chain.matrix
-        self.start = {
-            'speed': (config.speed_mean, config.speed_std),
-            'lateral_speed': (0.0, self.std),
-        }
-
-
 def moving(name: str, step: Callable[[FloatArray, float], Motion]) -> Model:
     """A model whose state is position and velocity."""
     return Model(name, ('px', 'py', 'vx', 'vy'), step)
@@ -219,19 +150,6 @@ def persistent(config: DiverConfig) -> FloatArray:
 
 
 # -- eq. (1) --------------------------------------------------------------------------------------
-
-
-class Stated:
-    """A chain of one second, at steps of one second: the matrix (M, M) as it is, also one that no
-    rates give."""
-
-    step = 1.0
-
-    def __init__(self, matrix: FloatArray):
-        self.matrix = matrix
-
-    def transition(self, dt: float) -> FloatArray:
-        return self.matrix
 
 
 class PaperChain:
@@ -285,12 +203,6 @@ def by_parameters(models: ModelSet, config: DiverConfig) -> AdaptiveChain:
     )
 
 
-def as_events(models: ModelSet, config: DiverConfig) -> AdaptiveChain:
-    """A chain that forgets at once has no rates."""
-    matrix = persistent(config)[:1].repeat(config.directions, axis=0)
-    return by_parameters(evolve(models, chain=Stated(matrix)), config)
-
-
 def guarded(form: str, models: ModelSet, config: DiverConfig) -> PaperChain:
     return PaperChain(models.chain.matrix, form)
 
@@ -315,12 +227,10 @@ TRACKERS = {
             'heading_concentration': 2.5,
         }
     ),
-    'relative_headings': Program({'model_set': 'bench_relative_headings'}, as_events),
     'heading_speed': Program(HEADINGS),
     'heading_speed, fixed transitions': Program({**HEADINGS, 'adaptation': 'fixed'}),
     'heading_speed, paper (guarded)': Program(HEADINGS, partial(guarded, 'product')),
     'heading_speed, ratio (guarded)': Program(HEADINGS, partial(guarded, 'ratio')),
-    'heading_speed_lateral': Program({'model_set': 'bench_heading_speed_lateral'}),
 }
 
 

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.study import final_estimates, Parts, study, truths
+from benchmarks.study import final_estimates, first_track, Parts, study, truths
 from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack
@@ -31,18 +31,14 @@ from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 SETTLED = 10.0
 """Seconds from the start that are not scored."""
 
-WRONG = 40.0
-"""Mean NEES of all three coordinates above which a run is at the wrong depth."""
-
 Values = Mapping[str, Any]
 Cells = list[tuple[str, str, str, Values, Values]]
 """Row, column, scenario, what it changes, parameters."""
 
 
 def score(scene: Scene, config: DiverConfig) -> np.ndarray:
-    """Rows (k, 5) of squared horizontal error, horizontal NEES, squared depth error, whole NEES
-    and `depth_ambiguous`; the last three NaN where depth is no state. A stamp without a track
-    gives NaN."""
+    """Rows (k, 4) of squared horizontal error, horizontal NEES, squared depth error and whole
+    NEES; the last two NaN where depth is no state. A stamp without a track gives NaN."""
     final = final_estimates(DiverTracker(config), (i.measurement for i in scene.measurements))
     return score_of(final, scene)
 
@@ -55,19 +51,16 @@ def score_of(final: Mapping[int, Estimate], scene: Scene) -> np.ndarray:
         if (stamp - track.stamp_ns[0]) * 1e-9 < SETTLED or stamp not in final:
             continue
         estimate = final[stamp]
-        confirmed = np.flatnonzero(estimate.extras['track_state'] > 0)
-        if not len(confirmed):
-            rows.append([np.nan] * 5)
+        if (found := first_track(estimate, track.position[k, :2])) is None:
+            rows.append([np.nan] * 4)
             continue
-        row = confirmed[0]
-        m = 3 if 'pz' in estimate.state_names else 2
-        error = estimate.state[row, :m] - track.position[k, :m]
-        P = estimate.covariance[row, :m, :m]
-        flat = error[:2] @ np.linalg.solve(P[:2, :2], error[:2])
-        whole = error @ np.linalg.solve(P, error) if m == 3 else np.nan
-        deep = error[2] ** 2 if m == 3 else np.nan
-        two = estimate.extras.get('depth_ambiguous', np.full(len(estimate), np.nan))[row]
-        rows.append([error[:2] @ error[:2], flat, deep, whole, two])
+        error, flat = found
+        deep = whole = np.nan
+        if 'pz' in estimate.state_names:
+            found = first_track(estimate, track.position[k, :3])
+            assert found is not None
+            deep, whole = found[0][2] ** 2, found[1]
+        rows.append([error @ error, flat, deep, whole])
     return np.array(rows)
 
 
@@ -90,45 +83,8 @@ def errors(scene: Values, config: Values, runs: int, name: str) -> dict[str, Any
         'nees': float(mean[1]),
         'rmse_depth': float(np.sqrt(mean[2])),
         'nees_3d': float(mean[3]),
-        'rmse_depth_of_runs': np.sqrt([np.nanmean(each[:, 2]) for each in rows]).round(3).tolist()
-        if np.isfinite(mean[2])
-        else [],
         'without_track': float(1.0 - seen.mean()),
-        **wrong_depths(rows),
     }
-
-
-def wrong_depths(rows: Sequence[np.ndarray]) -> dict[str, Any]:
-    """Of runs with depth: how many have a whole NEES above `WRONG`, how many of these never say
-    that there are two depths, and the share of estimates that do."""
-    if not np.isfinite(rows[0][:, 4]).any():
-        return {}
-    wrong = [each for each in rows if np.nanmean(each[:, 3]) > WRONG]
-    return {
-        'wrong_runs': len(wrong),
-        'silent_runs': sum(not np.nanmax(each[:, 4]) > 0.0 for each in wrong),
-        'ambiguous': float(np.nanmean(np.concatenate(rows)[:, 4])),
-    }
-
-
-def text_of(found: Mapping[str, Any]) -> str:
-    text = f'{found["rmse"]:.2f}'
-    if np.isfinite(found['rmse_depth']):
-        text += f' / {found["rmse_depth"]:.2f}'
-    text += f', {found["nees"]:.2g}'
-    if np.isfinite(found['nees_3d']):
-        text += f' / {found["nees_3d"]:.2g}'
-    if depths := found.get('rmse_depth_of_runs'):
-        text += f' (depth: half of the runs below {np.median(depths):.2f}'
-        text += f', nine tenths below {np.percentile(depths, 90):.2f})'
-    if 'wrong_runs' in found:
-        text += (
-            f' ({found["wrong_runs"]} runs wrong, {found["silent_runs"]} silent, two depths in '
-        )
-        text += f'{found["ambiguous"]:.0%})'
-    if found['without_track'] > 0.005:
-        text += f' ({found["without_track"]:.0%} no track)'
-    return text
 
 
 def middle_depth(scene: Scene) -> float:
@@ -265,7 +221,8 @@ TABLES = {
 
 
 def main(runs: int = 30, table: Sequence[str] | None = None, only: str = '') -> Parts:
-    yield {'runs': runs}
+    if table != [UNTOLD]:
+        yield {'runs': runs}  # the table of what is not stated has its own
     for name in table or TABLES:
         if name == UNTOLD:
             for scene_name, config in STATED.items():
@@ -282,11 +239,7 @@ def main(runs: int = 30, table: Sequence[str] | None = None, only: str = '') -> 
 if __name__ == '__main__':
     study(
         main,
-        shown=lambda row: (
-            {key: value for key, value in row.items() if key != 'NEES'}
-            if 'warn' in row
-            else {column: text_of(found) for column, found in row.items()}
-        ),
+        shown=lambda row: {k: value for k, value in row.items() if not isinstance(value, list)},
         table={'action': 'append', 'choices': [*TABLES, UNTOLD]},
         only={'help': 'columns or rows whose name holds this'},
     )

@@ -9,27 +9,18 @@
 """Accuracy of the fathometer tracker on simulated drifts, beside what it replaces.
 
     python -m benchmarks.fathometer_accuracy --runs 3 --out docs/results/fathometer_accuracy.json
-    python -m benchmarks.fathometer_accuracy --pulses --runs 5 --particles 5000 --out FILE
 
 Each run is one drift as cross-spectra (seven to nine reflectors over 300 records under the 32
 hydrophones of the paper; a quarter of the snapshot with four times as many, which says as much and
 is made four times as fast), processed twice (MVDR and conventional) and tracked by every
 configuration. OSPA has a cutoff of 2 m and order 2; a reflector within 0.4 m of a true one is
 neither false nor missed. Birth delay: records from the presence of a new reflector to the first of
-three records in a row that have it. Numbers are written after each run; other rows that are in the
-file are kept.
-
-`--pulses`: which pulse, that of the band or what the processor makes of each record, with either
-polarity. ``drift``: as above. ``strong`` and ``signed``: 16 hydrophones (as in `fathometer_sea`),
-100 snapshots, six layers of 7 to 34 sigma, in ``signed`` two of them negative; ``strong 32`` and
-``signed 32`` under the array of the drift; a tenth as many records for each run. The first five
-records are not scored; wrong signs are per record.
+three records in a row that have it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -43,16 +34,14 @@ from benchmarks.fathometer_paper import (
     PENALTY,
     reflectors,
 )
-from benchmarks.study import final_estimates, known, mean_of, Parts, rms, standard_error, study
+from benchmarks.study import final_estimates, mean_of, Parts, standard_error, study
 from sonar_imm.acoustics.fathometer import coherence, depth_response, noise_sigma, steering
-from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import CrossSpectra, Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
-from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of
+from sonar_imm_tools.simulation.fathometer.scenario import drift_of
 from sonar_imm_tools.simulation.fathometer.simulator import (
     cross_spectra,
     FathometerScenario,
-    scenario,
 )
 
 DEPTHS = (122.0, 1 / 32, 1600)
@@ -109,7 +98,16 @@ def responses(spectra: CrossSpectra) -> dict[str, Trace]:
 
 def drift(seed: int, records: int) -> tuple[dict[str, list[Trace]], Truth]:
     """Traces of one run by processor, and the true depths and ids of each record."""
-    config, floor, rng = drift_scene(seed, records)
+    scale = records / 300
+    config = FathometerScenario(
+        records=records,
+        snapshot_seconds=0.35,
+        snapshots=256,
+        appearing=(int(140 * scale), int(262 * scale)),
+        fading=(int(85 * scale),),
+    )
+    rng = np.random.default_rng(seed)
+    floor = drift_of(config, rng)
     traces: dict[str, list[Trace]] = {}
     truth = []
     # Cross-spectra of a whole drift would not fit into memory, nor does `check` let them.
@@ -156,144 +154,12 @@ def _delay(history: list[tuple[int, bool]]) -> int:
     return len(there)
 
 
-# -- pulses ---------------------------------------------------------------------------------------
-
-LAYER_DEPTHS = np.array([52.0, 55.2, 58.5, 61.7, 66.0, 69.3])
-STRENGTHS = np.array([0.35, 0.3, 0.25, 0.22, 0.2, 0.15])
-SIGNS = {'strong': np.ones(6), 'signed': np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0])}
-SCENES = {'strong': 16, 'signed': 16, 'strong 32': 32, 'signed 32': 32, 'drift': 32}
-"""Hydrophones of each."""
-UNSCORED = 5
-
-
-def records_of(
-    config: FathometerScenario, floor: Drift, rng: np.random.Generator
-) -> Iterator[tuple[CrossSpectra, np.ndarray, np.ndarray]]:
-    """Cross-spectra, true depths and true amplitudes of each record."""
-    for record in range(config.records):
-        depth = float(floor.array_depth_stated[record])
-        here = floor.present[record]
-        spectra = cross_spectra(config, floor, record, depth, rng)
-        yield spectra, floor.depth[record, here], floor.amplitude[record, here]
-
-
-def drift_scene(seed: int, records: int) -> tuple[FathometerScenario, Drift, np.random.Generator]:
-    scale = records / 300
-    config = FathometerScenario(
-        records=records,
-        snapshot_seconds=0.35,
-        snapshots=256,
-        appearing=(int(140 * scale), int(262 * scale)),
-        fading=(int(85 * scale),),
-    )
-    rng = np.random.default_rng(seed)
-    return config, drift_of(config, rng), rng
-
-
-def layers(
-    seed: int, records: int, signs: np.ndarray, hydrophones: int = 16
-) -> tuple[FathometerScenario, Drift, np.random.Generator]:
-    """The six layers under 16 hydrophones, or 80 m deeper and weaker under the 32 of the drift."""
-    changes: dict[str, Any] = {
-        'level': 'csdm',
-        'records': records,
-        'snapshots': 100,
-        'snapshot_seconds': 0.35,
-    }
-    config, first, strength = scenario('pressure', changes), LAYER_DEPTHS, STRENGTHS
-    if hydrophones == 32:
-        config = FathometerScenario(**{**changes, 'snapshots': 256})
-        first, strength = LAYER_DEPTHS + 80.0, 0.4 * STRENGTHS
-    rng = np.random.default_rng(seed)
-    depth = first + np.cumsum(0.05 * rng.standard_normal((records, 6)), axis=0)
-    array = config.array_depth + rng.uniform(-0.5, 0.5, records)
-    stated = array + config.array_depth_std * rng.standard_normal(records)
-    amplitude = np.tile(signs * strength, (records, 1))
-    return config, Drift(depth, amplitude, amplitude != 0.0, array, stated), rng
-
-
-def pulse_scores(
-    name: str,
-    seed: int,
-    records: int,
-    particles: int,
-    pulses: Sequence[str],
-    polarities: Sequence[str] = ('positive', 'both'),
-) -> dict[str, dict[str, float]]:
-    """Scores of each of `pulses` and `polarities`."""
-    if name == 'drift':
-        config, floor, rng = drift_scene(seed, records)
-    else:
-        config, floor, rng = layers(seed, records, SIGNS[name.split()[0]], SCENES[name])
-    settings = dict(config.instruments())
-    settings |= {'window': 'rectangular', 'overlap': 0.0, 'particles': particles, 'seed': seed}
-    settings |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
-    settings |= {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
-    trackers = {
-        f'{name}, {pulse}, {polarity}': FathometerTracker(
-            FathometerConfig(**settings, pulse=pulse, polarity=polarity)
-        )
-        for pulse in pulses
-        for polarity in polarities
-    }
-    scores: dict[str, list[list[float]]] = {label: [] for label in trackers}
-    for spectra, depth, amplitude in records_of(config, floor, rng):
-        for label, tracker in trackers.items():
-            (found,) = tracker.process(spectra)
-            scores[label].append(_pulse_score(found, depth, amplitude))
-    names = ('P', 'OSPA', 'depth RMS', 'wrong signs')
-    return {
-        label: {
-            key: float(
-                np.sqrt(np.nanmean(np.square(column)))
-                if key == 'depth RMS'
-                else np.nanmean(column)
-            )
-            for key, column in zip(names, np.array(each[UNSCORED:]).T)
-        }
-        for label, each in scores.items()
-    }
-
-
-def _pulse_score(found: Estimate, depth: np.ndarray, amplitude: np.ndarray) -> list[float]:
-    z = fathometer_paper.reflectors(found)
-    away = z[:, :1] - depth
-    near = np.abs(away) < 0.4
-    wrong = near & (np.sign(z[:, 1:2]) != np.sign(amplitude))
-    return [
-        *fathometer_paper.score(found, depth),
-        rms(away[near]) if near.any() else np.nan,
-        float(wrong.sum()),
-    ]
-
-
-def pulses_table(runs: int, records: int, particles: int, scenes: Sequence[str]) -> Parts:
-    for name in scenes:
-        length = records if name == 'drift' else max(10, records // 10)
-        scores: dict[str, list[dict[str, float]]] = {}
-        for seed in range(runs):
-            made = pulse_scores(name, seed, length, particles, ('band', 'processor'))
-            for label, row in made.items():
-                each = scores.setdefault(label, [])
-                each.append(row)
-                error = {'P, s.e.': standard_error([row['P'] for row in each])}
-                yield {'table': {label: {'runs': float(len(each))} | mean_of(each) | error}}
-
-
 def main(
     runs: int = 3,
     records: int = 300,
     particles: int = 20_000,
     rows: Sequence[str] = (),
-    pulses: bool = False,
-    out: Path | None = None,
 ) -> Parts:
-    yield known(out)
-    if pulses:
-        wanted_scenes = [name for name in SCENES if not rows or any(word in name for word in rows)]
-        yield {'records': records}
-        yield from pulses_table(runs, records, particles, wanted_scenes)
-        return
     wanted = {
         label: given
         for label, given in CONFIGURATIONS.items()

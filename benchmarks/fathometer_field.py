@@ -6,18 +6,11 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The fathometer in the field: hydrophones that differ, profiler lines, waves and faults, a depth
-that is told wrongly, and what can be counted. Nothing is told to the tracker but what a recording
-has.
+"""The fathometer in the field: hydrophones that differ, waves and faults, a depth that is told
+wrongly, what can be counted, and profiler lines. Nothing is told to the tracker but what a
+recording has.
 
     python -m benchmarks.fathometer_field --out docs/results/fathometer_field.json
-
-lines: 120 envelopes of a Gaussian pulse of 0.15 m, 0.05 m a sample over 20 m, in complex noise of
-rms 0.02 with echoes of modulus one for the floor at about 10 m and of 0.5 and 0.25 at 3 m and 6 m
-below it, each of a phase of its own. ghosts: reflectors a record of existence 0.5 or more that lie
-more than 1 m above the floor; label: share of the records whose greatest `is_bottom` is within
-0.5 m of the floor, and what it says there; inside: share with the floor within two
-`bottom_depth_std` of `bottom_depth`. Records after the tenth count.
 
 phones: cross-spectra of 16 hydrophones 0.25 m apart from 100 to 2800 Hz, 100 snapshots, three
 layers, 10 records, scored after four, with `phone_correction` off and full.
@@ -29,21 +22,16 @@ an autoregression of 0.9). Without jumps: common_jump_probability 0. ids: for ea
 counted: scenes of 3 to 7 layers of log-uniform 1.5 to 20 sigma; how probable the numbers of
 reflectors above 4 sigma, and of all, were said to be, and how often it was so.
 
-halves: of the lines of real data, if SONAR_IMM_DATA names them, even and odd traces: share of the
-records whose floors differ by more than 0.75 m, and what is said where they do and do not.
-
-profilers: the same lines, converted and tracked by the command as docs/fathometer.md says, with
-the water found and off. The floor is picked without a tracker: the first of three successive
-samples above an eighth of what loud traces reach (`edge`), and the greatest of the four from there
-on (`followed`); a record is followed when a reflector lies within 1 m of that. at_twice_the_floor:
-reflectors within 1 m of that, of which so many are marked as multiples. Where lines cross, their
+profilers: the lines of real data, if SONAR_IMM_DATA names them, converted and tracked by the
+command as docs/fathometer.md says, with the water found and off. The floor is picked without a
+tracker: the first of three successive samples above an eighth of what loud traces reach (`edge`),
+and the greatest of the four from there on (`followed`); a record is followed when a reflector lies
+within 1 m of that. at_twice_the_floor: reflectors within 1 m of that, of which so many are marked
+as multiples. Where lines cross, their
 horizons are compared; L3 and L9 cross where the floor is at 4 m, above the first sample that is
 taken (4.5 m), so that this crossing is made once more from the end of the transmit pulse on (3.4
 m). depth_std and the form of the likelihood were chosen on L2 and L9; the rule by which the first
 return keeps its name, and the chain of the water, were made with all four in view.
-
-cost: CPU ms a record of 20,000 particles, of the first scene of moving (800 cells), without jumps
-and with; and of `correct_phones` for 16 hydrophones and 541 frequencies.
 """
 
 from __future__ import annotations
@@ -53,169 +41,24 @@ from functools import partial
 import os
 from pathlib import Path
 import tempfile
-import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.study import known, Parts, standard_error, study
+from benchmarks.study import Parts, standard_error, study
 from sonar_imm.acoustics.ambient import sample_csdm, surface_noise_csdm
-from sonar_imm.acoustics.hydrophones import correct_phones
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import CrossSpectra, Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
-from sonar_imm.trackers.fathometer.water import Water
 from sonar_imm_tools.cli import main as command
 from sonar_imm_tools.evaluation.fathometer.crossing import crossing_metrics, summary
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.recordings.segy_lines import read_segy
 
-STEP, SAMPLES, RECORDS, PULSE, NOISE = 0.05, 400, 120, 0.15, 0.02
-SETTLED, APART, SPACING = 10, 0.75, 0.376
-LINES: dict[str, dict[str, Any]] = {
-    'flat': {},
-    'quiet water': {'noise': 0.002},
-    'silent water': {'noise': 0.002, 'threshold': 0.02},
-    'growing gain': {'gain': 0.12},
-    'coarse': {'steps': 32},
-    'soft floor': {'floor': 0.15},
-    'scatter': {'scatter': 0.3},
-    'transmit pulse': {'ring': 1.5},
-    'waves': {'waves': 2.5},
-    'fault': {'fault': 3.0},
-    'fish': {'fish': 0.4},
-    'echo at a fixed depth': {'fixed': 0.2, 'waves': 1.0},
-}
-
-
-def line(
-    seed: int,
-    *,
-    records: int = RECORDS,
-    noise: float = NOISE,
-    threshold: float = 0.0,
-    gain: float = 0.0,
-    steps: int = 0,
-    floor: float = 1.0,
-    scatter: float = 0.0,
-    ring: float = 0.0,
-    waves: float = 0.0,
-    fault: float = 0.0,
-    fish: float = 0.0,
-    fixed: float = 0.0,
-) -> tuple[list[Trace], FloatArray]:
-    """Traces of a line, and the depth of its floor (T,), m. threshold: below which nothing is
-    written; gain: growth of all by e over so many 1/m; steps of a converter up to one; floor:
-    amplitude; scatter: rms below it, falling over 1.5 m; ring: m of transmit pulse; waves:
-    amplitude, m, in 25 records; fault, m, at half of the line; fish: share of the records with a
-    school; fixed: amplitude of an echo at 4 m."""
-    rng, depth = np.random.default_rng(seed), STEP * np.arange(SAMPLES)
-    record = np.arange(records)
-    below = 10.0 + 0.3 * np.sin(record / 19.0) + waves * np.sin(2.0 * np.pi * record / 25.0)
-    below = below + fault * (record >= records // 2)
-    traces = []
-
-    def echo(place: float, amplitude: float, width: float = PULSE) -> FloatArray:
-        phase = np.exp(2j * np.pi * rng.random())
-        return amplitude * phase * np.exp(-0.5 * np.square((depth - place) / width))
-
-    for k, z in enumerate(below):
-        field = noise * _normal(rng, SAMPLES) + echo(z, floor)
-        field = field + echo(z + 3.0, 0.5 * floor) + echo(z + 6.0, 0.25 * floor)
-        if scatter:
-            under = np.maximum(depth - z, 0.0)
-            level = scatter * np.exp(-under / 1.5) * (depth > z)
-            field = field + level * _normal(rng, SAMPLES)
-        if rng.random() < fish:
-            school = rng.uniform(3.0, 8.0)
-            for place in school + 0.3 * rng.standard_normal(4):
-                field = field + echo(place, rng.uniform(0.1, 0.5))
-        if fixed:
-            field = field + echo(4.0, fixed)
-        if ring:
-            field = field + 2.0 * np.exp(-np.maximum(depth - ring, 0.0) / 0.1)
-        heard = np.abs(field) * np.exp(gain * depth)
-        if steps:
-            heard = np.round(heard * steps) / steps
-        heard[heard < threshold] = 0.0
-        traces.append(Trace(stamp_ns=(k + 1) * 10**9, depth=depth, amplitude=heard))
-    return traces, below
-
-
-def _normal(rng: np.random.Generator, count: int) -> FloatArray:
-    return rng.standard_normal((count, 2)) @ np.array([1.0, 1j]) / np.sqrt(2.0)
-
-
-def tracked(traces: Sequence[Trace], floor: FloatArray, particles: int) -> dict[str, float]:
-    """A line with nothing told but what converters write."""
-    config = FathometerConfig(
-        particles=particles, min_separation=0.45, depth_std=0.35, order_max=6, sound_speed_std=0.0
-    )
-    tracker, rows = FathometerTracker(config), []
-    for trace, z in zip(traces, floor.tolist()):
-        for estimate in tracker.process(trace):
-            found = estimate.columns()
-            if trace.stamp_ns <= SETTLED * 10**9:
-                continue
-            depth, label = found['depth'], np.nan_to_num(found['is_bottom'])
-            best = int(np.argmax(label))
-            near = np.abs(depth - z) < 0.5
-            error = found['bottom_depth'][0] - z
-            rows.append(
-                (
-                    np.sum((found['existence'] >= 0.5) & (depth < z - 1.0)),
-                    abs(depth[best] - z) < 0.5,
-                    label[near].max(initial=0.0),
-                    abs(error) <= 2.0 * found['bottom_depth_std'][0],
-                    abs(error),
-                )
-            )
-    ghosts, right, said, inside, error = np.array(rows, np.float64).T
-    return {
-        'ghosts': float(ghosts.mean()),
-        'label': float(right.mean()),
-        'said': float(said.mean()),
-        'inside': float(inside.mean()),
-        'error': float(np.nanmedian(error)),
-        'warnings': float(len(tracker.warnings())),
-    }
-
-
-def halves(path: Path, spacing: float) -> dict[str, float]:
-    """Even and odd traces of a real line, each stacked in pairs, as two lines."""
-    amplitude = read_segy(path).amplitude
-    depth = spacing * np.arange(amplitude.shape[1])
-    floors = []
-    for half in (amplitude[::2], amplitude[1::2]):
-        water, found = Water(FathometerConfig()), []
-        stacked = half[: len(half) // 2 * 2].reshape(-1, 2, half.shape[1]).mean(axis=1)
-        for k, row in enumerate(stacked):
-            trace = Trace(stamp_ns=k + 1, depth=depth, amplitude=row)
-            if water.active is None:
-                water.begin(trace)
-            _, _, floor = water.take(trace)
-            sure = floor.posterior[:-1]
-            said = 0.0
-            if len(sure):
-                best = int(np.argmax(sure))
-                said = float(sure[max(0, best - 2) : best + 3].sum())
-            found.append((*floor.depth, said))
-        floors.append(np.array(found))
-    count = min(map(len, floors))
-    (z, std, said), (other, other_std, _) = (each[SETTLED:count].T for each in floors)
-    apart = np.abs(z - other)
-    inside = apart <= 2.0 * np.hypot(std, other_std)
-    differ = ~(apart <= APART)
-    return {
-        'records': float(count - SETTLED),
-        'apart': float(differ.mean()),
-        'inside': float(inside.mean()),
-        'said where apart': float(said[differ].mean()) if differ.any() else float('nan'),
-        'said where not': float(said[~differ].mean()),
-    }
+SPACING = 0.376
 
 
 def real_lines() -> list[Path]:
@@ -491,43 +334,11 @@ def phones(seed: int, particles: int, kind: str, correction: str) -> dict[str, f
     return scored(tracked_records(), 4)
 
 
-# -- cost -----------------------------------------------------------------------------------------
-
-
-def cost(seed: int, _: int) -> dict[str, float]:
-    """CPU ms a record, of 20,000 particles."""
-    still = np.zeros(20)
-    traces = layered(seed, still, still, LAYERS, STRENGTH)[0]
-    found = {}
-    for name, chance in (('without jumps', 0.0), ('with jumps', 0.05)):
-        config = FathometerConfig(particles=20_000, common_jump_probability=chance, **BAND)
-        tracker = FathometerTracker(config)
-        tracker.process(traces[0])
-        begin = time.process_time()
-        for trace in traces[1:]:
-            tracker.process(trace)
-        found[f'{name}, ms'] = 1e3 * (time.process_time() - begin) / (len(traces) - 1)
-    rng = np.random.default_rng([seed, 4])
-    clean = surface_noise_csdm(FREQUENCY, PHONES, SPACING_M, HEIGHTS, ECHOES, 1500.0)
-    csdm = sample_csdm(clean + 0.01 * np.eye(PHONES), 100, rng)
-    begin = time.process_time()
-    for _ in range(10):
-        correct_phones(csdm, FREQUENCY, np.arange(PHONES), 1500.0 / SPACING_M, 0.1)
-    found['levelling of 16 hydrophones, ms'] = 1e3 * (time.process_time() - begin) / 10
-    return found
-
-
 # -- the study ------------------------------------------------------------------------------------
-
-
-def of_line(seed: int, particles: int, kind: str) -> dict[str, float]:
-    return tracked(*line(seed, **LINES[kind]), particles)
 
 
 def rows_of(case: str) -> dict[str, Callable[[int, int], dict[str, float]]]:
     """The rows of a table, each of a seed and a number of particles."""
-    if case == 'lines':
-        return {kind: partial(of_line, kind=kind) for kind in LINES}
     if case == 'phones':
         return {
             f'{kind}, {how}': partial(phones, kind=kind, correction=how)
@@ -541,10 +352,10 @@ def rows_of(case: str) -> dict[str, Callable[[int, int], dict[str, float]]]:
             for kind in kinds
             for jumps in (False, True)
         }
-    return {case: counted if case == 'counted' else cost}
+    return {case: counted}
 
 
-CASES = ('cost', 'moving', 'counted', 'phones', 'lines', 'halves', 'profilers')
+CASES = ('moving', 'counted', 'phones', 'profilers')
 
 
 def main(
@@ -552,19 +363,13 @@ def main(
     first: int = 0,
     particles: int = 3000,
     cases: Sequence[str] = CASES,
-    out: Path | None = None,
 ) -> Parts:
     """first: the first seed."""
-    yield known(out)
-    for path in real_lines() if 'halves' in cases else ():
-        yield {'halves': {path.stem.split('_SBP_')[1][:5]: halves(path, SPACING)}}
     if 'profilers' in cases and real_lines():
         with tempfile.TemporaryDirectory() as folder:
             yield from profilers(Path(folder))
     for case in cases:
-        if case in ('halves', 'profilers'):
-            continue
-        for name, row in rows_of(case).items():
+        for name, row in rows_of(case).items() if case != 'profilers' else ():
             found = []
             for seed in range(first, first + runs):
                 found.append(row(seed, particles))
@@ -575,7 +380,7 @@ def main(
                         (label, float(np.mean([each[label] for each in found]))),
                         (f'{label}, s.e.', standard_error([each[label] for each in found])),
                     )
-                    if not key.endswith('s.e.') or label in ('P', 'OSPA', 'label', 'ghosts')
+                    if not key.endswith('s.e.') or label in ('P', 'OSPA')
                 }
                 yield {case: {name: {'runs': len(found), 'particles': particles} | means}}
 

@@ -10,10 +10,7 @@
 
     python -m benchmarks.fathometer_paper --out docs/results/fathometer_paper.json
 
-``vectors``: the 300 records of test/vectors/fathometer/mvdr_traces.npz, with their noise as it is,
-an eighth too low (by so much it fades between where it is measured and where it is needed), and
-their envelopes (modulus of the analytic signal) with the noise of the real part, and 1.1 and 1.25
-times that. ``array``: drifts of the paper as cross-spectra through the tracker, 32 phones, by its
+``array``: drifts of the paper as cross-spectra through the tracker, 32 phones, by its
 configurations: the default, the paper's (`PAPER`), and both with the output of the array changed.
 Penalties of amplitudes and the bootstrap filter are no parameters; `ChangedTracker` sets them in
 the model of the sets. P is the share of records whose number of reflectors is right; OSPA of
@@ -23,24 +20,20 @@ second order, cutoff 2 m.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from attrs import evolve
 import numpy as np
-from scipy.signal import hilbert
 
 from benchmarks.study import Parts, study
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.estimation.set_model import SetModel
-from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.response import Lattice
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
-from sonar_imm_tools.simulation.fathometer.scenario import drift_of, PRESENT
+from sonar_imm_tools.simulation.fathometer.scenario import drift_of
 from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, FathometerScenario
 
-VECTORS = Path(__file__).parents[1] / 'test' / 'vectors' / 'fathometer' / 'mvdr_traces.npz'
 ORDERS: dict[str, Any] = {
     'order_min': 7,
     'order_max': 9,
@@ -57,15 +50,6 @@ PAPER: dict[str, Any] = {**ENVELOPE, 'output': 'correlation', 'envelope': True}
 """The paper's choices: correlation that is not normalised, its envelope, and, with `PENALTY` and
 `BOOTSTRAP`, a bootstrap filter with 7 to 9 reflectors and N^-m. Equation (4) as printed has the
 echoes above the array."""
-OF_VECTORS: dict[str, tuple[str, float, dict[str, Any], dict[str, Any]]] = {
-    'default': ('real', 1.0, {}, {}),
-    'noise an eighth too low': ('real', 7.0 / 8.0, {}, {}),
-    'envelope, N^-m': ('envelope', 1.0, ENVELOPE, PENALTY),
-    'envelope, N^-m, 1.1 times the noise': ('envelope', 1.1, ENVELOPE, PENALTY),
-    'envelope, N^-m, 1.25 times the noise': ('envelope', 1.25, ENVELOPE, PENALTY),
-    'real part, N^-m': ('real', 1.0, ORDERS, PENALTY),
-}
-"""Kind of trace, factor on its noise, parameters, and what of `SetModel` is changed."""
 OF_ARRAY: dict[str, dict[str, Any]] = {
     'default': {},
     'default, correlation': {'output': 'correlation'},
@@ -111,34 +95,6 @@ def summary(scores: Iterable[tuple[float, float]]) -> dict[str, float]:
     }
 
 
-def of_vectors(particles: int) -> dict[str, dict[str, float]]:
-    with np.load(VECTORS) as file:
-        kept = {name: file[name] for name in file}
-    depth = kept['depth'].astype(float)
-    value = kept['amplitude'].astype(float)
-    # Mirrored at the ends, so that the circle has no step.
-    padded = np.concatenate([value[:, ::-1], value, value[:, ::-1]], axis=1)
-    envelope = np.abs(hilbert(padded, axis=1))[:, len(depth) : 2 * len(depth)]
-    strength = kept['reflector_amplitude']
-    there = strength > PRESENT * np.nanmax(strength, axis=0)
-    sigma = np.broadcast_to(np.ravel(kept['sigma']).astype(float), len(value))
-    table = {}
-    for label, (kind, factor, options, changes) in OF_VECTORS.items():
-        config = FathometerConfig(particles=particles, sound_speed_std=0.0, **options)
-        tracker = ChangedTracker(config, **changes)
-        scores = []
-        for k, column in enumerate(value if kind == 'real' else envelope):
-            trace = Trace(
-                stamp_ns=(k + 1) * 90 * 10**9,
-                depth=depth,
-                amplitude=column,
-                sigma=np.full(len(depth), factor * sigma[k]),
-            )
-            scores.append(score(tracker.process(trace)[-1], kept['reflector_depth'][k, there[k]]))
-        table[label] = summary(scores)
-    return table
-
-
 def of_array(runs: int, records: int, particles: int) -> dict[str, dict[str, float]]:
     scores: dict[str, list[tuple[float, float]]] = {label: [] for label in OF_ARRAY}
     for seed in range(runs):
@@ -175,20 +131,9 @@ def of_array(runs: int, records: int, particles: int) -> dict[str, dict[str, flo
     return {label: summary(each) for label, each in scores.items()}
 
 
-def main(
-    runs: int = 2, records: int = 60, particles: int = 20_000, only: str | None = None
-) -> Parts:
-    yield {'particles': particles}
-    if only != 'array':
-        yield {'vectors': of_vectors(particles)}
-    if only != 'vectors':
-        yield {'array': of_array(runs, records, particles)}
+def main(runs: int = 2, records: int = 60, particles: int = 20_000) -> Parts:
+    yield {'particles': particles, 'array': of_array(runs, records, particles)}
 
 
 if __name__ == '__main__':
-    study(
-        main,
-        runs={'help': 'drifts of the array'},
-        records={'help': 'of each of them'},
-        only={'choices': ('vectors', 'array')},
-    )
+    study(main, runs={'help': 'drifts'}, records={'help': 'of each of them'})

@@ -16,7 +16,7 @@ record to record; ships and noise of the hydrophones. Pressure is drawn from the
 model over each whole record, in whole numbers of 2.5 steps to a standard deviation where it says
 so; cross-spectra are drawn from the same model frequency by frequency, of as many snapshots as fit
 into the record side by side, which gives a response of the same noise. Every row has the same
-floors. Rows are written as runs end, and a file that is there already is added to. P is the share
+floors. Rows are written as runs end. P is the share
 of records whose number of reflectors is right, OSPA of second order with a cutoff of 2 m; SNR the
 median amplitude of each layer in units of the noise.
 """
@@ -25,14 +25,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 from attrs import evolve
 import numpy as np
 
 from benchmarks.fathometer_paper import reflectors, score
-from benchmarks.study import known, Parts, standard_error, study
+from benchmarks.study import Parts, standard_error, study
 from sonar_imm.trackers.fathometer.pressure import automatic_snapshot
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, FathometerScenario
@@ -133,10 +132,7 @@ def row_of(runs: list[dict[str, Any]]) -> dict[str, float]:
     return row | {f'SNR {k + 1}': float(value) for k, value in enumerate(snr)}
 
 
-def main(
-    runs: int = 20, particles: int = 5000, rows: Sequence[str] = (), out: Path | None = None
-) -> Parts:
-    yield known(out)
+def main(runs: int = 20, particles: int = 5000, rows: Sequence[str] = ()) -> Parts:
     yield {'particles': particles}
     wanted = [name for name in ROWS if not rows or any(word in name for word in rows)]
     # Rows of one level and scene see the same noise, which is drawn once.

@@ -27,7 +27,6 @@ import numpy as np
 
 from benchmarks.study import final_estimates, Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
-from sonar_imm.estimation.consistency import gospa
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm.truth import Scene
 from sonar_imm_tools.simulation.obstacle.simulator import (
@@ -51,7 +50,6 @@ CASES = (
 )
 LEVER = {'sonar_lever': (2.0, 0.0, -0.3)}
 """Where the study has its sonar, which is not where scenes have it."""
-GOSPA_CUTOFF = 5.0
 NEAR = 5.0
 """Metres in range and bearing within which a track follows the obstacle."""
 
@@ -128,71 +126,16 @@ def case(
 def summary(rows: list[list[list[float] | None]]) -> dict[str, float]:
     table: dict[str, float] = {}
     for column, at in enumerate(RANGES):
-        found = np.array([row[column] for row in rows if row[column] is not None])
-        error, squared, inside = found.T
-        table |= {
-            f'RMSE {at:.0f} m': rms(error),
-            f'bias {at:.0f} m': float(np.mean(error)),
-            f'NEES {at:.0f} m': float(np.mean(squared)),
-            f'cover {at:.0f} m': float(np.mean(inside)),
-            f'lost {at:.0f} m': float(1.0 - len(found) / len(rows)),
-        }
+        if found := [row[column] for row in rows if row[column] is not None]:
+            error, squared, inside = np.array(found).T
+            table |= {
+                f'RMSE {at:.0f} m': rms(error),
+                f'bias {at:.0f} m': float(np.mean(error)),
+                f'NEES {at:.0f} m': float(np.mean(squared)),
+                f'cover {at:.0f} m': float(np.mean(inside)),
+            }
+        table[f'lost {at:.0f} m'] = 1.0 - len(found) / len(rows)
     return table
-
-
-def several(runs: int) -> dict[str, dict[str, float]]:
-    """Mean GOSPA of six obstacles in clutter, as is and when a track ends with the beam."""
-    table = {}
-    for label, values in {'six': {}, 'six, ended with the beam': {'max_coast': 3.0}}.items():
-        parts = []
-        for seed in range(runs):
-            setting = scenario('six', LEVER)
-            scene = simulate(setting, seed)
-            final = track(scene, config_of(setting, **values))
-            stamps = truths(scene, TrueObstacle)[0].stamp_ns
-            parts += [score(scene, ping, final) for ping in range(len(stamps))]
-        mean = np.nanmean([part for part in parts if part is not None], axis=0)
-        names = ('GOSPA', 'localisation', 'missed', 'false', 'NEES', 'cover')
-        table[label] = dict(zip(names, map(float, mean)))
-    return table
-
-
-def score(scene: Scene, ping: int, final: dict[int, Estimate]) -> tuple[float, ...] | None:
-    """GOSPA of one ping and its parts, NEES and coverage of the matched. An obstacle is there from
-    when the beam has held it for six pings until it has been passed."""
-    stamp = int(truths(scene, TrueObstacle)[0].stamp_ns[ping])
-    if stamp not in final:
-        return None
-    there = [
-        truth
-        for truth in truths(scene, TrueObstacle)
-        if truth.in_beam[: ping + 1].sum() >= 6 and ahead(truth, ping)
-    ]
-    points, confirmed = level(final[stamp])
-    true = np.reshape([true_level(truth, ping) for truth in there], (-1, 2))
-    rows = np.flatnonzero(confirmed)
-    found = gospa(true, points[rows], GOSPA_CUTOFF)
-    squared, inside = [], []
-    for truth, match in zip(there, found.estimate_of):
-        if match >= 0:
-            row, true_offset = rows[match], truth.vertical_offset[ping]
-            error = final[stamp].state[row, 2] - true_offset
-            squared.append(error**2 / final[stamp].covariance[row, 2, 2])
-            low, high = (final[stamp].extras[f'vertical_offset_{e}'][row] for e in ('lo', 'hi'))
-            inside.append(low <= true_offset <= high)
-    return (
-        found.distance,
-        found.localisation,
-        found.missed,
-        found.false,
-        float(np.mean(squared)) if squared else np.nan,
-        float(np.mean(inside)) if inside else np.nan,
-    )
-
-
-def ahead(truth: TrueObstacle, ping: int) -> bool:
-    r, offset = truth.range[ping], truth.vertical_offset[ping]
-    return bool(np.sqrt(max(r**2 - offset**2, 0.0)) * np.cos(truth.bearing[ping]) > 0.2 * r)
 
 
 def parsed(given: str) -> tuple[str, Any]:
@@ -203,21 +146,21 @@ def parsed(given: str) -> tuple[str, Any]:
 
 def main(
     runs: int = 300,
-    cases: Sequence[str] = (*CASES, 'six'),
+    cases: Sequence[str] = CASES,
     scene: Sequence[str] = (),
     tracker: Sequence[str] = (),
 ) -> Parts:
     yield {'runs': runs}
     changes = [dict(map(parsed, given)) for given in (scene, tracker)]
     for name in cases:
-        yield {name: several(runs // 3) if name == 'six' else case(name, runs, *changes)}
+        yield {name: case(name, runs, *changes)}
 
 
 if __name__ == '__main__':
     study(
         main,
         digits=2,
-        cases={'choices': [*CASES, 'six']},
+        cases={'choices': CASES},
         scene={'help': 'name=value of the scene'},
         tracker={'help': 'name=value of the tracker'},
     )

@@ -30,8 +30,8 @@ offset holds the truth, over the fixed obstacles of `approaches` scenes per offs
 the tenth of the obstacles of which it holds least, `width` its mean width. `beam` is the same for
 obstacles 4 m above and below, where the beam is not as high as the tracker was told:
 
-    python -m benchmarks.obstacle_calibration --cases band
-    python -m benchmarks.obstacle_calibration --cases beam --approaches 2
+    python -m benchmarks.obstacle_calibration --cases band --add --out FILE
+    python -m benchmarks.obstacle_calibration --cases beam --approaches 2 --add --out FILE
 """
 
 from __future__ import annotations

@@ -19,20 +19,18 @@ Clutter is added to the scene: `30 false` all over, `ring of 12` at 55 to 59 m (
 floor), `sector of 12` between 10 and 16 degrees to starboard; each is a mean number in a ping.
 `field of 14` has obstacles of three kinds, eight of them fixed. Navigation drifts in any
 direction, the sonar is turned to either side, or poses come late, each untold. `scan of 9 s`: a
-sonar that turns by 40 degrees/s, at .5 m/s; each row has its time, and `GOSPA` and `missed` count
-pings at which the tracker published something.
+sonar that turns by 40 degrees/s, at .5 m/s; each row has its time, and `missed` counts pings at
+which the tracker published something.
 
-Of all pings in which the beam holds an obstacle: `GOSPA` of order 1 and cut 4 m, of confirmed
-tracks (a missed or false one costs 2), the share `missed`, and `false` tracks a ping; `false/h`
-counts tracks that follow nothing for more than half of their pings, in an hour. `confirm` is the
-median time from the first ping in the beam to a confirmed track, s, infinite where it was none;
-`place` the mean distance in the plane, m; `P` the mean probability of the true behaviour after 27
-s. `offset`, `NEES` and `band` are of the vertical offset between 60 and 40, and 40 and 25 m.
-Pings of one encounter err alike: `band se` is the standard error of the band by encounters.
+Of all pings in which the beam holds an obstacle: the share `missed` by confirmed tracks within
+4 m, and `false` tracks a ping. `confirm` is the median time from the first ping in the beam to a
+confirmed track, s, infinite where it was none; `P` the mean probability of the true behaviour
+after 27 s. `offset`, `NEES` and `band` are of the vertical offset between 60 and 40, and 40 and
+25 m. Pings of one encounter err alike: `band se` is the standard error of the band by encounters.
 Encounters of one seed are the same but for what a scene names, so `fixed, +3 m` is `30 false`, and
 `P_D .3` is `P_D .3, 5 false`, told which echoes are the obstacle's.
 `said`: share of the encounters after which users are told of errors of the navigation, or that
-obstacles move alike; `good`: median of `navigation_good` at the end.
+obstacles move alike.
 
 `reliability` compares what is stated with what is true, by bins of what is stated, over all rows
 that are published of all scenes of a run: `existence`, of tentative tracks too, true where a real
@@ -50,6 +48,7 @@ import numpy as np
 from benchmarks.obstacle_accuracy import level, LEVER, true_level
 from benchmarks.study import final_estimates, Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
+from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Detections, Measurement, Navigation
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
@@ -298,32 +297,15 @@ def encounter(name: str, seed: int) -> tuple[list[Measurement], list[tuple[str, 
     return change(measurements, seed) if change else measurements, obstacles
 
 
-def matched(points: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """The track (n,) at each true place (n, 2), -1 for none."""
-    from scipy.optimize import linear_sum_assignment
-
-    found = np.full(len(true), -1)
-    if len(points) and len(true):
-        distance = np.linalg.norm(true[:, None] - points[None], axis=2)
-        for i, j in zip(*linear_sum_assignment(np.minimum(distance, CUT))):
-            if distance[i, j] < CUT:
-                found[i] = j
-    return found
-
-
 class Sums:
     """What is summed over the pings of several encounters."""
 
     def __init__(self) -> None:
-        self.gospa: list[float] = []
-        self.due = self.missed = self.pings = self.false = self.false_ids = 0
-        self.seconds = 0.0
+        self.due = self.missed = self.pings = self.false = 0
         self.confirm: list[float] = []
-        self.place: list[float] = []
         self.behaviour: dict[str, list[float]] = {}
         self.offset: list[list[tuple[float, float, float]]] = [[] for _ in BANDS]
         self.held: list[list[float]] = [[] for _ in BANDS]
-        self.switches = 0
         self.existence: list[tuple[float, bool]] = []
         self.stated: list[tuple[float, bool]] = []
 
@@ -332,8 +314,6 @@ class Sums:
         stamps = obstacles[0][1].stamp_ns
         first = {k: int(np.argmax(truth.in_beam)) for k, (_, truth) in enumerate(obstacles)}
         confirmed: dict[int, float] = {}
-        follows: dict[int, list[bool]] = {}
-        last_id: dict[int, int] = {}
         before = [len(rows) for rows in self.offset]
         for ping, stamp in enumerate(stamps.tolist()):
             estimate = final.get(stamp)
@@ -342,39 +322,24 @@ class Sums:
             t = (stamp - stamps[0]) * 1e-9
             points, sure = level(estimate)
             rows = np.flatnonzero(sure)
-            ids = estimate.extras['track_id'][rows]
             true = np.array([true_level(truth, ping) for _, truth in obstacles])
-            real = set(matched(points, true).tolist())
+            real = gospa(true, points, CUT, 1.0).estimate_of
             for row, r in enumerate(estimate.extras['existence'].tolist()):
                 self.existence.append((r, row in real))
-            found = matched(points[rows], true)
+            found = gospa(true, points[rows], CUT, 1.0).estimate_of
             inside = np.array([truth.in_beam[ping] for _, truth in obstacles])
-            for row, track in enumerate(ids.tolist()):
-                follows.setdefault(track, []).append(bool((found == row).any()))
-            missed, false = inside & (found < 0), len(rows) - int((found >= 0).sum())
-            there = np.flatnonzero(found >= 0)
-            off = np.linalg.norm(points[rows[found[there]]] - true[there], axis=1)
             if inside.any():
                 self.due += int(inside.sum())
-                self.missed += int(missed.sum())
+                self.missed += int((inside & (found < 0)).sum())
                 self.pings += 1
-                self.false += false
-                self.gospa.append(float(off.sum()) + 0.5 * CUT * (missed.sum() + false))
-            self.place += off.tolist()
-            for k, j in enumerate(found.tolist()):
-                if j < 0:
-                    continue
+                self.false += len(rows) - int((found >= 0).sum())
+            for k in np.flatnonzero(found >= 0).tolist():
                 confirmed.setdefault(k, t - (stamps[first[k]] - stamps[0]) * 1e-9)
-                track = int(ids[j])
-                self.switches += last_id.get(k, track) != track
-                last_id[k] = track
-                self._add_row(estimate, int(rows[j]), obstacles[k], ping, t)
+                self._add_row(estimate, int(rows[found[k]]), obstacles[k], ping, t)
         for held, offsets, start in zip(self.held, self.offset, before):
             if new := offsets[start:]:
                 held.append(float(np.mean([inside for *_, inside in new])))
         self.confirm += [confirmed.get(k, np.inf) for k in range(len(obstacles))]
-        self.false_ids += sum(1 for each in follows.values() if np.mean(each) < 0.5)
-        self.seconds += (stamps[-1] - stamps[0]) * 1e-9
 
     def _add_row(
         self,
@@ -402,12 +367,9 @@ class Sums:
     def row(self) -> dict[str, float]:
         """The row of the table."""
         found = {
-            'GOSPA': float(np.mean(self.gospa)),
             'missed': self.missed / self.due,
             'false': self.false / self.pings,
-            'false/h': 3600.0 * self.false_ids / self.seconds,
             'confirm': float(np.median(self.confirm)),
-            'place': float(np.mean(self.place)) if self.place else np.nan,
             **{f'P {does}': float(np.mean(p)) for does, p in self.behaviour.items()},
         }
         for (far, near), rows, held in zip(BANDS, self.offset, self.held):
@@ -420,7 +382,7 @@ class Sums:
             }
             if len(held) > 1:
                 found[f'band se {name}'] = float(np.std(held, ddof=1) / np.sqrt(len(held)))
-        return {**found, 'switches': float(self.switches)}
+        return found
 
 
 def binned(stated: Sequence[tuple[float, bool]]) -> dict[str, dict[str, float]]:
@@ -440,20 +402,17 @@ def binned(stated: Sequence[tuple[float, bool]]) -> dict[str, dict[str, float]]:
 
 def scene(name: str, belief: str, runs: int, first: int = 0) -> tuple[dict[str, float], Sums]:
     """One row of the table, and its sums."""
-    sums, good, said = Sums(), [], 0
+    sums, said = Sums(), 0
     for seed in range(first, first + runs):
         given, obstacles = encounter(name, seed)
         config = ObstacleConfig(sonar_lever=LEVER['sonar_lever'], **BELIEFS[belief])
         tracker = ObstacleTracker(config)
         sums.add(final_estimates(tracker, given), obstacles)
-        good.append(tracker.health()['navigation_good'])
         words = 'navigation drifts', 'poses', 'seems to be turned'
         said += bool(tracker.health()['pings_moving_alike']) or any(
             word in each for each in tracker.warnings() for word in words
         )
-    row = {'runs': runs, **sums.row(), 'said': said / runs}
-    known = [value for value in good if np.isfinite(value)]
-    return row | ({'good': float(np.median(known))} if known else {}), sums
+    return {'runs': runs, **sums.row(), 'said': said / runs}, sums
 
 
 def main(

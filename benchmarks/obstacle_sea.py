@@ -17,7 +17,6 @@ nearest, at most 5 m off; `lost` counts the runs without one. P is the mean prob
 behaviour at 30 m, v the RMSE of the velocity of each axis there.
 `velocity` is the RMSE of the velocity of each axis at times after an obstacle is seen first or,
 while it is followed, begins to move or stops, of those in the beam.
-`movers` has three movers in clutter at once, over their whole way.
 Forecasts of collisions: `benchmarks.obstacle_calibration`.
 """
 
@@ -31,7 +30,6 @@ import numpy as np
 from benchmarks.obstacle_accuracy import (
     config_of,
     LEVER,
-    NEAR,
     nearest,
     offset_at,
     RANGES,
@@ -41,8 +39,6 @@ from benchmarks.obstacle_accuracy import (
 from benchmarks.study import Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS
-from sonar_imm_tools.evaluation.obstacle.scoring import score
-from sonar_imm_tools.evaluation.obstacle.series import series_of, truth_of
 from sonar_imm_tools.simulation.obstacle.scenario import SCENARIOS
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
@@ -78,7 +74,7 @@ METHODS: dict[str, dict[str, Any]] = {
     'all': {'behaviours': BEHAVIOURS},
 }
 AT = 30.0
-EVERY = (*CASES, 'velocity', 'movers')
+EVERY = (*CASES, 'velocity')
 
 
 def followed(
@@ -157,7 +153,7 @@ def case(name: str, runs: int, first: int = 0) -> dict[str, dict[str, float]]:
     table = {}
     for method, rows in offsets.items():
         table[f'{name}, {method}'] = {
-            **{key: value for key, value in guarded(rows).items() if 'bias' not in key},
+            **{key: value for key, value in summary(rows).items() if 'bias' not in key},
             'tracks per obstacle': tracks[method] / runs,
         }
     known = np.array([row for row in does if row is not None])
@@ -168,58 +164,16 @@ def case(name: str, runs: int, first: int = 0) -> dict[str, dict[str, float]]:
     return table
 
 
-def movers(runs: int) -> dict[str, dict[str, float]]:
-    """Three movers in clutter, as in the recording `obstacle_movers`, judged as a run is."""
-    setting = scenario('movers')
-    found = []
-    for seed in range(1, runs + 1):
-        scene = simulate(setting, seed)
-        final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
-        tables = [table for truth in truths(scene, TrueObstacle) for table in truth_tables(truth)]
-        metrics, _ = score(series_of(final.values()), truth_of(tables), cutoff=NEAR, gap=60.0)
-        tracks = metrics['tracks']
-        found.append(
-            [
-                metrics['vertical_offset_near']['rmse_m'],
-                metrics['consistency']['band_coverage'],
-                metrics['consistency']['nees_offset']['mean'],
-                tracks['found_obstacles'] / tracks['true_obstacles'],
-                tracks['false_tracks'],
-                tracks['identity_switches'],
-            ]
-        )
-    names = ('RMSE within 50 m', 'cover', 'NEES', 'found', 'false tracks', 'switches')
-    return {
-        'mean': dict(zip(names, np.mean(found, axis=0).tolist())),
-        'median': dict(zip(names, np.median(found, axis=0).tolist())),
-    }
-
-
 def truth_tables(truth: TrueObstacle) -> Iterator[Estimate]:
     """The truth of an obstacle as `evaluate` reads it from a recording."""
     for table in truth.tables('odom'):
         yield Estimate.from_columns(table.columns, stamp_ns=table.stamp_ns)
 
 
-def guarded(rows: list[list[list[float] | None]]) -> dict[str, float]:
-    """`summary`, also where every run lost the obstacle at some range."""
-    if all(any(row[k] for row in rows) for k in range(len(RANGES))):
-        return summary(rows)
-    table = {}
-    for k, at in enumerate(RANGES):
-        error = [found[0] for row in rows if (found := row[k])]
-        table[f'RMSE {at:.0f} m'] = rms(error) if error else np.nan
-        table[f'lost {at:.0f} m'] = 1.0 - len(error) / len(rows)
-    return table
-
-
 def main(runs: int = 100, first: int = 0, cases: Sequence[str] = EVERY) -> Parts:
     yield {'runs': runs}
     for name in cases:
-        if name in CASES:
-            yield {name: case(name, runs, first)}
-        else:
-            yield {name: movers(runs) if name == 'movers' else velocity(runs)}
+        yield {name: case(name, runs, first) if name in CASES else velocity(runs)}
 
 
 if __name__ == '__main__':

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from benchmarks.recordings import autoferry, boat_scores, BOATS, DATA, HEADINGS
-from benchmarks.study import final_estimates, Parts, study
+from benchmarks.recordings import autoferry, BOATS, DATA, HEADINGS, scores
+from benchmarks.study import final_estimates, mean_of, Parts, study
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
@@ -148,25 +148,23 @@ TRACKERS: dict[str, tuple[Make, tuple[float, ...]]] = {
 }
 
 
-def half(final: dict[int, Estimate], middle_ns: int, second: bool) -> dict[int, Estimate]:
-    return {stamp: estimate for stamp, estimate in final.items() if (stamp >= middle_ns) == second}
-
-
 def tuned(make: Make, noises: Sequence[float], items: list, truth: np.ndarray) -> dict[str, float]:
     """Scores of each half with the setting that is best in the other; all but GOSPA are means."""
     stamps = sorted(item.stamp_ns for item in items)
     middle = stamps[len(stamps) // 2]
-    runs = [final_estimates(make(*s), items) for s in product(noises, STDS, LIVES)]
-    halves = [
-        [boat_scores(half(final, middle, second), truth) for final in runs]
-        for second in (False, True)
-    ]
-    best = [int(np.argmin([scores[0] for scores in each])) for each in halves]
+    halves: list[list[dict[str, float]]] = [[], []]
+    for setting in product(noises, STDS, LIVES):
+        final = final_estimates(make(*setting), items)
+        for k, part in enumerate(halves):
+            part.append(scores([final[s] for s in sorted(final) if (s >= middle) == k], truth))
+    best = [int(np.argmin([each['GOSPA'] for each in part])) for part in halves]
     scored = [halves[0][best[1]], halves[1][best[0]]]
-    means = np.mean([scores[1:] for scores in scored], axis=0).tolist()
+    means = mean_of(scored)
     return {
-        **{name: float(scores[0]) for name, scores in zip(HALVES, scored)},
-        **dict(zip(('missed', 'false', 'tracks', 'RMSE'), means)),
+        **{name: each['GOSPA'] for name, each in zip(HALVES, scored)},
+        **{name: means[name] for name in ('missed', 'false')},
+        'tracks': means['ids'],
+        'RMSE': means['RMSE'],
     }
 
 

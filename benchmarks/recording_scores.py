@@ -34,18 +34,14 @@ from benchmarks.recordings import (
     autoferry,
     DATA,
     HEADINGS,
-    LAG,
     PACE,
-    raw_fixes,
+    raw,
+    scores,
     TAG,
-    tag_scores,
     thinned,
 )
 from benchmarks.recordings import load as load_bag
 from benchmarks.study import final_estimates, Parts, study
-from sonar_imm.estimates import Estimate
-from sonar_imm.estimation.consistency import gospa
-from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.recordings.convert import convert_arrivals, convert_fixes
@@ -53,7 +49,6 @@ from sonar_imm_tools.recordings.convert import convert_arrivals, convert_fixes
 NOISE = 0.1
 BOATS = ('radar', 'lidar')
 WAYS, RECEIVERS = 8, (5, 4, 3)
-CUTOFF, NINETY_FIVE, LONGEST_GAP = 20.0, 5.991, 60.0
 SINGLE: dict[str, dict[str, Any]] = {
     'CV Kalman': {'model_set': 'bench_cv', 'acceleration_noise': (NOISE,)},
     'steady alone (heading_speed)': HEADINGS,
@@ -88,55 +83,6 @@ def load(kind: str) -> tuple[list[Any], np.ndarray]:
     return (thinned(items, int(receivers_a_ping), 1.0) if receivers_a_ping else items), places
 
 
-def present(truth: np.ndarray, at: float) -> np.ndarray:
-    """Where the targets (k, 2) are at a time, by their own rows next to it."""
-    places = []
-    for number in np.unique(truth[:, 1]):
-        path = truth[truth[:, 1] == number]
-        after = int(np.searchsorted(path[:, 0], at))
-        if 0 < after < len(path) and path[after, 0] - path[after - 1, 0] < LONGEST_GAP:
-            places.append([np.interp(at, path[:, 0], path[:, c]) for c in (2, 3)])
-    return np.reshape(places, (-1, 2))
-
-
-def scores(estimates: Sequence[Estimate], truth: np.ndarray, tag: bool) -> dict[str, float]:
-    """What a recording makes of a tracker: of a tag every estimate counts, however far it is."""
-    cutoff, lag = (1e6, LAG) if tag else (CUTOFF, 0.0)
-    squared: list[float] = []
-    normalised: list[float] = []
-    ids: set[int] = set()
-    there, distance = 0, []
-    for estimate in estimates:
-        at = present(truth, estimate.stamp_ns * 1e-9 + lag)
-        if tag and not len(at):
-            continue
-        rows = np.flatnonzero(estimate.extras['track_state'] > 0)
-        state, P = estimate.state[rows, :2], estimate.covariance[rows, :2, :2]
-        found = gospa(at, state, cutoff, 2)
-        distance.append(found.distance)
-        there += len(at)
-        ids.update(estimate.extras['track_id'][rows].tolist())
-        for target, row in enumerate(found.estimate_of):
-            if row >= 0:
-                error = state[row] - at[target]
-                squared.append(float(error @ error))
-                normalised.append(float(error @ np.linalg.solve(P[row], error)))
-    out = {
-        'RMSE': float(np.sqrt(np.mean(squared))),
-        'NEES': float(np.mean(normalised)),
-        'coverage': float(np.mean(np.array(normalised) < NINETY_FIVE)),
-        'seen': len(squared) / there,
-        'ids': len(ids),
-    }
-    if not tag:
-        return {**out, 'GOSPA': float(np.mean(distance))}
-    return {
-        **out,
-        'RMSE, no lag': tag_scores(list(estimates), truth)[0],
-        'median': float(np.median(np.sqrt(squared))),
-    }
-
-
 def trackers(kind: str, stated: dict[str, Any]) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Each tracker of a recording by its name."""
     clutter = {'clutter_density': 1e-5} if kind in BOATS else {}
@@ -151,30 +97,6 @@ def trackers(kind: str, stated: dict[str, Any]) -> Iterator[tuple[str, Callable[
         yield 'plain CV Kalman', lambda: PlainKalman(0.3, stated['fix_std'], 3, 5)
 
 
-def raw(items: Sequence[Any], stated: dict[str, Any]) -> list[Estimate]:
-    """Each fix, or what each ping gives by itself, as an estimate of its own; of scans each fix as
-    a track that was never seen before."""
-    if not isinstance(items[0], Fixes):
-        return raw_fixes(list(items), DiverConfig(**stated))
-    R, out, number = stated['fix_std'] ** 2 * np.eye(2), [], 0
-    for scan in items:
-        count = len(scan)
-        extras = {'track_id': number + np.arange(count), 'track_state': np.ones(count, int)}
-        number += count
-        out.append(
-            Estimate(
-                stamp_ns=scan.stamp_ns,
-                frame_id='map',
-                xyz=np.zeros((count, 3), np.float32),
-                state_names=('px', 'py'),
-                state=np.reshape(scan.position[:, :2], (-1, 2)),
-                covariance=np.tile(R, (count, 1, 1)),
-                extras=extras,
-            )
-        )
-    return out
-
-
 def of_recording(name: str) -> Iterator[tuple[str, dict[str, float]]]:
     """The rows of a recording's table, each with its name."""
     kind, stated = RECORDINGS[name]
@@ -182,7 +104,7 @@ def of_recording(name: str) -> Iterator[tuple[str, dict[str, float]]]:
     tag, arrivals = kind not in BOATS, kind.startswith('arrivals')
     # Of a tag two arrivals give a hyperbola, and a single arrival nothing.
     shown = {item.stamp_ns for item in items if not arrivals or len(item) >= 3}
-    yield 'raw', scores(raw(items, stated), truth, tag)
+    yield 'raw', scores(raw(items, DiverConfig(**stated)), truth, tag)
     for label, make in trackers(kind, stated):
         final = final_estimates(make(), items)
         kept = [final[stamp] for stamp in sorted(final) if stamp in shown]

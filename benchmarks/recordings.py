@@ -20,6 +20,7 @@ left out. The targets are boats, not divers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import json
 import os
 from pathlib import Path
@@ -92,6 +93,7 @@ def _nanoseconds(seconds: float) -> int:
 
 
 LAG = 3.4
+CUTOFF, NINETY_FIVE, LONGEST_GAP = 20.0, 5.991, 60.0
 
 TAG: dict[str, Any] = {
     'max_tracks': 1,
@@ -129,65 +131,42 @@ def load(bag: Path) -> tuple[list, np.ndarray]:
     return [each for each in found if not isinstance(each, Rejection)], np.array(truth)
 
 
-def against_gps(
-    stamps: np.ndarray, places: np.ndarray, truth: np.ndarray, lag: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Error (k, 2) at the stamps inside the GPS recording and not inside one of its gaps, and
-    which stamps those are."""
-    t = stamps + lag
-    after = np.clip(np.searchsorted(truth[:, 0], t), 1, len(truth) - 1)
-    good = (
-        (t >= truth[0, 0]) & (t <= truth[-1, 0]) & (truth[after, 0] - truth[after - 1, 0] < 60.0)
-    )
-    there = np.column_stack([np.interp(t, truth[:, 0], truth[:, c]) for c in (2, 3)])
-    return (places - there)[good], good
-
-
-def tag_scores(estimates: list, truth: np.ndarray) -> list[float]:
-    """RMSE as it is and with the lag, median, NEES with the lag."""
-    rows = [
-        (e.stamp_ns * 1e-9, e.state[0, :2], e.covariance[0, :2, :2]) for e in estimates if len(e)
-    ]
-    stamps, places, covariances = (np.array(column) for column in zip(*rows))
-    plain, _ = against_gps(stamps, places, truth, 0.0)
-    lagged, good = against_gps(stamps, places, truth, LAG)
-    squared = np.einsum(
-        'ki,ki->k', lagged, np.linalg.solve(covariances[good], lagged[..., None])[..., 0]
-    )
-    distance = np.hypot(*lagged.T)
-    return [
-        np.sqrt(np.mean(np.sum(plain**2, 1))),
-        np.sqrt(np.mean(distance**2)),
-        np.median(distance),
-        squared.mean(),
-        len(distance),
-    ]
-
-
-def raw_fixes(items: list, config: DiverConfig) -> list[Estimate]:
-    """The fixes themselves, or those that each ping gives by itself, as tracks without a past."""
-    rows = []
+def raw(items: Sequence[Any], config: DiverConfig) -> list[Estimate]:
+    """The fixes themselves, or those that each ping gives by itself, each a track without a
+    past."""
+    out: list[Estimate] = []
+    number = 0
     for item in items:
-        if isinstance(item, Fix):
+        places, R = np.empty((0, 2)), np.empty((0, 2, 2))
+        if isinstance(item, Fixes):
+            places = item.position[:, :2]
+            R = np.tile(config.fix_std**2 * np.eye(2), (len(places), 1, 1))
+        elif isinstance(item, Fix):
             assert item.covariance is not None
-            covariance = config.covariance_scale * item.covariance[:2, :2]
-            rows.append((item.stamp_ns, item.position[:2], covariance))
-        elif isinstance(item, Arrivals):
-            fix = locate_fix(item, np.arange(len(item)), config)
-            rows += [(item.stamp_ns, fix.position, fix.covariance)] if fix else []
-    alone = {'track_state': np.ones(1, np.uint8)}
-    return [
-        Estimate(
-            stamp_ns=stamp_ns,
-            frame_id='map',
-            xyz=np.zeros((1, 3), np.float32),
-            state_names=('px', 'py'),
-            state=place[None, :2],
-            covariance=np.asarray(covariance)[None],
-            extras={**alone, 'track_id': np.array([number])},
+            places = item.position[None, :2]
+            R = config.covariance_scale * item.covariance[None, :2, :2]
+        elif fix := locate_fix(item, np.arange(len(item)), config):
+            places, R = fix.position[None, :2], np.asarray(fix.covariance)[None]
+        else:
+            continue
+        count = len(places)
+        extras: dict[str, Any] = {
+            'track_id': number + np.arange(count),
+            'track_state': np.ones(count, np.uint8),
+        }
+        number += count
+        out.append(
+            Estimate(
+                stamp_ns=item.stamp_ns,
+                frame_id='map',
+                xyz=np.zeros((count, 3), np.float32),
+                state_names=('px', 'py'),
+                state=np.reshape(places, (-1, 2)),
+                covariance=R,
+                extras=extras,
+            )
         )
-        for number, (stamp_ns, place, covariance) in enumerate(rows)
-    ]
+    return out
 
 
 def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
@@ -202,24 +181,52 @@ def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
     return out
 
 
-def boat_scores(final: dict, truth: np.ndarray) -> list[float]:
-    distance, missed, false, ids, squared = [], 0, 0, set(), []
-    for stamp in sorted(final):
-        estimate = final[stamp]
-        rows = estimate.extras['track_state'] > 0
-        present = []
-        for number in np.unique(truth[:, 1]):
-            path = truth[truth[:, 1] == number]
-            if path[0, 0] <= stamp * 1e-9 <= path[-1, 0]:
-                present.append([np.interp(stamp * 1e-9, path[:, 0], path[:, c]) for c in (2, 3)])
-        result = gospa(np.reshape(present, (-1, 2)), estimate.state[rows, :2], 20.0, 2)
-        distance.append(result.distance)
-        pairs = [(i, j) for i, j in enumerate(result.estimate_of) if j >= 0]
-        missed += len(present) - len(pairs)
-        false += int(rows.sum()) - len(pairs)
-        squared += [
-            np.sum((np.array(present[i]) - estimate.state[rows, :2][j]) ** 2) for i, j in pairs
-        ]
+def present(truth: np.ndarray, at: float) -> np.ndarray:
+    """Where the targets (k, 2) are at a time, by their own rows next to it."""
+    places = []
+    for number in np.unique(truth[:, 1]):
+        path = truth[truth[:, 1] == number]
+        after = int(np.searchsorted(path[:, 0], at))
+        if 0 < after < len(path) and path[after, 0] - path[after - 1, 0] < LONGEST_GAP:
+            places.append([np.interp(at, path[:, 0], path[:, c]) for c in (2, 3)])
+    return np.reshape(places, (-1, 2))
+
+
+def scores(
+    estimates: Sequence[Estimate], truth: np.ndarray, tag: bool = False
+) -> dict[str, float]:
+    """What a recording makes of a tracker: of a tag every estimate counts, however far it is."""
+    cutoff, lag = (1e6, LAG) if tag else (CUTOFF, 0.0)
+    squared: list[float] = []
+    normalised: list[float] = []
+    ids: set[int] = set()
+    there = false = 0
+    distance = []
+    for estimate in estimates:
+        at = present(truth, estimate.stamp_ns * 1e-9 + lag)
+        if tag and not len(at):
+            continue
+        rows = np.flatnonzero(estimate.extras['track_state'] > 0)
+        state, P = estimate.state[rows, :2], estimate.covariance[rows, :2, :2]
+        found = gospa(at, state, cutoff, 2)
+        distance.append(found.distance)
+        there += len(at)
         ids.update(estimate.extras['track_id'][rows].tolist())
-    n = len(final)
-    return [np.mean(distance), missed / n, false / n, len(ids), np.sqrt(np.mean(squared))]
+        matched = np.flatnonzero(found.estimate_of >= 0)
+        false += len(rows) - len(matched)
+        for target, row in zip(matched, found.estimate_of[matched]):
+            error = state[row] - at[target]
+            squared.append(float(error @ error))
+            normalised.append(float(error @ np.linalg.solve(P[row], error)))
+    out = {
+        'RMSE': float(np.sqrt(np.mean(squared))),
+        'NEES': float(np.mean(normalised)),
+        'coverage': float(np.mean(np.array(normalised) < NINETY_FIVE)),
+        'seen': len(squared) / there,
+        'ids': len(ids),
+    }
+    if tag:
+        return {**out, 'median': float(np.median(np.sqrt(squared)))}
+    count = len(estimates)
+    wrong = {'missed': (there - len(squared)) / count, 'false': false / count}
+    return {**out, 'GOSPA': float(np.mean(distance)), **wrong}

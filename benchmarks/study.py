@@ -21,9 +21,8 @@ each with its default, and which yields its numbers as parts of one JSON object:
         study(main, cases={'choices': list(CASES)})
 
 Parts are merged; what is a table, or a row of one, is printed as it comes, and ``--out FILE``
-holds all that is known so far. The rest of this module is what several studies compute, among it
-Monte Carlo runs of a scene: each is simulated, tracked and scored as `sonar-imm simulate`, `track`
-and `evaluate` do.
+holds all that is known so far; with ``--add`` beside what is in the file already. The rest of this
+module is what several studies compute.
 """
 
 from __future__ import annotations
@@ -33,37 +32,22 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from datetime import date
 from functools import cache
-from importlib import import_module
 import inspect
 from itertools import groupby
 import json
-import math
 from multiprocessing import get_context
 import os
 from pathlib import Path
 import shlex
 import subprocess
 import sys
-from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
-from attrs import evolve, field, frozen
 import numpy as np
 
 from sonar_imm.estimates import Estimate
-from sonar_imm.parameters import Config
-from sonar_imm.trackers import SYSTEMS
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.truth import Scene
-from sonar_imm_tools.cli.common import load_config, typed_overrides
-from sonar_imm_tools.evaluation.judging import judge
-from sonar_imm_tools.evaluation.numbers import flatten
-from sonar_imm_tools.offline.jobs import sentence_of
-from sonar_imm_tools.offline.jobs import workers as sharing
-from sonar_imm_tools.offline.run_folder import RunFolder
-from sonar_imm_tools.offline.tracking import InputOptions, OfflineRun, write_run
-from sonar_imm_tools.recordings.own_files import unusual
-from sonar_imm_tools.recordings.reader import BagReader
-from sonar_imm_tools.recordings.truth import write_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 ENTRY = str(ROOT / 'benchmarks' / 'entry')
@@ -74,9 +58,6 @@ if ENTRY not in sys.path:
 Parts = Iterator[Mapping[str, Any]]
 Row = Mapping[str, Any]
 T = TypeVar('T')
-
-ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
-"""Environment variables that are 1 in processes that share the cores."""
 
 
 def study(
@@ -103,9 +84,10 @@ def study(
             parser.add_argument(f'--{name.replace("_", "-")}', **settings)
     file = {'type': Path, 'help': 'write the numbers here, as JSON', **options.get('out', {})}
     parser.add_argument('--out', **file)
+    parser.add_argument('--add', action='store_true', help='keep what is in the file')
     given = vars(parser.parse_args())
     out = given['out'] if 'out' in parameters else given.pop('out')
-    content: dict[str, Any] = {}
+    content, before = known_with_made(out) if given.pop('add') else ({}, {})
     printed: dict[str, int] = {}
     for part in main(**given):
         merge(content, part)
@@ -118,7 +100,7 @@ def study(
                 words = ', '.join(f'{key} {cell(value, digits)}' for key, value in row.items())
                 print(f'{name}: {words}')
         sys.stdout.flush()
-        write_json(out, content)
+        write_json(out, content, before)
     for title, table in tables(content, shown):
         if len(table) != printed.get(title, 0):
             print(f'\n{title}\n\n{markdown(table, digits)}')
@@ -196,21 +178,44 @@ def markdown(table: Mapping[str, Row], digits: int = 3) -> str:
     return '\n\n'.join(parts)
 
 
-def write_json(path: Path | None, content: Mapping[str, Any]) -> None:
-    """Write `content` with how it was made, and the folders to it; nothing without a path."""
+def write_json(
+    path: Path | None, content: Mapping[str, Any], before: Mapping[str, str] | None = None
+) -> None:
+    """Write `content` with how it was made, and the folders to it; nothing without a path.
+
+    before: how the file that this adds to was made.
+    """
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
-        text = json.dumps({'made': made(), **content}, indent=1)
+        how = added(before, made()) if before else made()
+        text = json.dumps({'made': how, **content}, indent=1)
         path.write_text(text + '\n', encoding='utf-8')
+
+
+def added(before: Mapping[str, str], now: Mapping[str, str]) -> dict[str, str]:
+    """How a file was made that was there and was added to: day and commit are those of the first
+    command, each other one says its commit."""
+    others = [
+        each for each in before['command'].split('; ') if not each.startswith(now['command'])
+    ]
+    return {
+        **before,
+        'command': '; '.join([*others, f'{now["command"]} at commit {now["commit"]}']),
+    }
 
 
 def known(path: Path | None) -> dict[str, Any]:
     """What is in the file of an earlier run but how it was made; nothing when there is none."""
+    return known_with_made(path)[0]
+
+
+def known_with_made(path: Path | None) -> tuple[dict[str, Any], dict[str, str]]:
+    """As `known`, and how it was made."""
     if path is None or not path.is_file():
-        return {}
+        return {}, {}
     content: dict[str, Any] = json.loads(path.read_text(encoding='utf-8'))
-    content.pop('made', None)
-    return content
+    how: dict[str, str] = content.pop('made', {})
+    return content, how
 
 
 @cache
@@ -264,6 +269,17 @@ def final_estimates(tracker: Any, measurements: Iterable[Any]) -> dict[int, Esti
     return final
 
 
+def first_track(estimate: Estimate, place: FloatArray) -> tuple[FloatArray, float] | None:
+    """Error (m,) of the first confirmed track against where the target is (m,), and its NEES; None
+    without one."""
+    firm, m = np.flatnonzero(estimate.extras['track_state'] > 0), len(place)
+    if not len(firm):
+        return None
+    error = estimate.state[firm[0], :m] - place
+    P = estimate.covariance[firm[0], :m, :m]
+    return error, float(error @ np.linalg.solve(P, error))
+
+
 def truths(scene: Scene, kind: type[T]) -> tuple[T, ...]:
     """What is true of a scene, by its type."""
     return tuple(truth for truth in scene.truth if isinstance(truth, kind))
@@ -273,140 +289,3 @@ def in_fresh_process(function: Callable[..., T], *arguments: Any) -> T:
     """The result of a call in a process of its own, with nothing compiled or kept from before."""
     with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:
         return pool.submit(function, *arguments).result()
-
-
-# -- many seeds of one scene ----------------------------------------------------------------------
-
-
-@frozen(kw_only=True)
-class Plan:
-    """Settings that all runs of a scene share.
-
-    scene: parameters of the scenario; config: of the tracker, its own seed included.
-    """
-
-    system: str
-    scenario: str
-    scene: Config
-    config: Config
-    options: InputOptions
-
-
-@frozen
-class Outcome:
-    """Result of one run: flat metrics by name, or the reason why there are none."""
-
-    seed: int
-    metrics: Mapping[str, float] = field(factory=dict)
-    failure: str = ''
-    versions: Mapping[str, str] = field(factory=dict)
-
-
-def planned(system: str, scenario: str, overrides: dict[str, str]) -> Plan:
-    """Plan the runs of a scene. The tracker gets the parameters of the instruments of the scene.
-
-    overrides: parameters of the scene, as texts. Raises `ConfigError` for unknown ones.
-    """
-    scenes = import_module(SYSTEMS[system].scenes)
-    scene = scenes.scenario(scenario, typed_overrides(type(scenes.scenario(scenario)), overrides))
-    config, node = load_config(SYSTEMS[system], None, {})
-    return Plan(
-        system=system,
-        scenario=scenario,
-        scene=scene,
-        config=evolve(config, **unusual(scene.instruments(), type(config))),
-        options=InputOptions(
-            frame_id=node.frame_id,
-            world_frame=node.world_frame_convention,
-            detector=scene.feeder_instruments(),
-        ),
-    )
-
-
-def run_seed(plan: Plan, seed: int) -> Outcome:
-    """Simulate, track and score one seed in a temporary folder. Never raises."""
-    with TemporaryDirectory(prefix='sonar_imm_study_') as place:
-        try:
-            return _run(plan, seed, Path(place))
-        except Exception as error:
-            # The place differs from run to run; the sentence has to be the same each time.
-            return Outcome(seed, failure=sentence_of(error).replace(f'{place}{os.sep}', ''))
-
-
-def _run(plan: Plan, seed: int, place: Path) -> Outcome:
-    scenes = import_module(SYSTEMS[plan.system].scenes)
-    bag, folder = place / 'scene', RunFolder(place / 'run')
-    write_scene(scenes.simulate(plan.scene, seed), bag, provenance={'seed': str(seed)})
-    with BagReader(bag) as reader:
-        offline = OfflineRun(reader, SYSTEMS[plan.system], plan.config, plan.options)
-        with folder.fresh() as unfinished:
-            run = write_run(unfinished, offline)
-    return Outcome(seed, finite_numbers(judge(folder).metrics), versions=run['versions'])
-
-
-def run_seeds(plan: Plan, seeds: Sequence[int], workers: int) -> Iterator[Outcome]:
-    """Run all seeds, in this process or shared by `workers` processes; yield them as they end.
-
-    The outcomes do not depend on the number of processes.
-    """
-    if workers > 1:
-        # Before the processes start: an algebra library reads them once, when it is loaded.
-        os.environ.update(dict.fromkeys(ONE_THREAD, '1'))
-    with sharing(workers) as run:
-        for k, outcome, failure in run(run_seed, [(plan, seed) for seed in seeds]):
-            yield outcome or Outcome(seeds[k], failure=failure)
-
-
-def finite_numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Return the finite numbers among nested metrics by dotted name; True is 1."""
-    return {
-        name: int(value) if isinstance(value, bool) else value
-        for name, value in flatten(metrics).items()
-        if isinstance(value, (bool, int, float)) and math.isfinite(value)
-    }
-
-
-def summarise(outcomes: Iterable[Outcome]) -> dict[str, dict[str, float]]:
-    """Summarise each metric over the runs that have it.
-
-    Gives `runs` (their number), mean, std (of one run), stderr (of the mean), p05 and p95. With
-    one run std and stderr are NaN.
-    """
-    values: dict[str, list[float]] = {}
-    for outcome in sorted(outcomes, key=lambda outcome: outcome.seed):
-        for name, value in outcome.metrics.items():
-            values.setdefault(name, []).append(value)
-    return {name: _spread(np.array(numbers, np.float64)) for name, numbers in values.items()}
-
-
-def _spread(values: np.ndarray) -> dict[str, float]:
-    count = len(values)
-    std = float(np.std(values, ddof=1)) if count > 1 else math.nan
-    low, high = np.percentile(values, [5.0, 95.0])
-    return {
-        'runs': count,
-        'mean': float(np.mean(values)),
-        'std': std,
-        'stderr': std / math.sqrt(count),
-        'p05': float(low),
-        'p95': float(high),
-    }
-
-
-def record(plan: Plan, outcomes: Iterable[Outcome]) -> dict[str, Any]:
-    """Return the content of a file of results: scene, parameters, versions and the summary."""
-    ordered = sorted(outcomes, key=lambda outcome: outcome.seed)
-    versions: dict[str, set[str]] = {}
-    for outcome in ordered:
-        for name, version in outcome.versions.items():
-            versions.setdefault(name, set()).add(version)
-    return {
-        'system': plan.system,
-        'scenario': plan.scenario,
-        'scene': plan.scene.as_dict(),
-        'parameters': plan.config.as_dict(),
-        'seeds': [outcome.seed for outcome in ordered],
-        'failures': {str(run.seed): run.failure for run in ordered if run.failure},
-        'versions': {name: ' and '.join(sorted(found)) for name, found in versions.items()},
-        'summary': summarise(ordered),
-    }

@@ -21,28 +21,34 @@ what nine in ten of these runs stay below, rounded up to two digits.
 
 ``--write`` makes the recording of that seed with its limit (``check.yaml``) and a README.md that
 says all this; with ``--keep SEED`` the recording that is there stays, whose seed it names.
-``--out`` writes mean, deviation and standard error of all metrics as JSON.
 ``--seed`` begins the runs, ``--set`` changes the scene.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from importlib import import_module
+import io
+import json
 import math
 import os
 from pathlib import Path
 import shutil
 import sys
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from attrs import frozen
 import numpy as np
 
-from benchmarks.study import markdown, Outcome, Plan, planned, record, run_seeds, write_json
+from benchmarks.study import markdown
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main as sonar_imm
 from sonar_imm_tools.evaluation.judging import Limit
+from sonar_imm_tools.evaluation.numbers import flatten
+from sonar_imm_tools.offline.jobs import workers as sharing
 from sonar_imm_tools.recordings.own_files import write_own_limit
 
 SHARE = 0.9
@@ -63,25 +69,27 @@ class Typical:
     spread: dict[str, dict[str, float]]
 
 
-def typical(
-    outcomes: Sequence[Outcome], metrics: Sequence[str], keep: int | None = None
-) -> Typical:
+Runs = Mapping[int, Mapping[str, float]]
+"""By seed, what `evaluate` says; nothing of a run that failed."""
+
+
+def typical(runs: Runs, metrics: Sequence[str], keep: int | None = None) -> Typical:
     """The typical one of runs, or the seed to `keep`; the first of the metrics has the limit.
 
     Raises ValueError when a metric is missing in more than half of the runs.
     """
-    runs = sorted(outcomes, key=lambda run: run.seed)
-    error = np.array([[abs(run.metrics.get(name, math.inf)) for name in metrics] for run in runs])
+    seeds = sorted(runs)
+    error = np.array([[abs(runs[s].get(name, math.inf)) for name in metrics] for s in seeds])
     for name, column in zip(metrics, error.T):
         if 2 * np.isinf(column).sum() >= len(runs):
-            known = sorted({name for run in runs for name in run.metrics})
+            known = sorted({name for run in runs.values() for name in run})
             raise ValueError(f'most runs have no {name}; there are: {", ".join(known)}')
     rank = np.argsort(np.argsort(error, axis=0, kind='stable'), axis=0)
     off = np.abs(rank - (len(runs) - 1) // 2)
     # The worst rank decides, then the sum of all, then the first metric.
     best = int(np.lexsort((off[:, 0], off.sum(axis=1), off.max(axis=1)))[0])
     if keep is not None:
-        best = [run.seed for run in runs].index(keep)
+        best = seeds.index(keep)
     spread = {}
     for name, column in zip(metrics, error.T):
         finite = column[np.isfinite(column)]
@@ -97,7 +105,7 @@ def typical(
             'runs': float(len(finite)),
         }
     limit = rounded_up(spread[metrics[0]][f'{100 * SHARE:.0f} %'])
-    return Typical(runs[best].seed, int(rank[best, 0]) + 1, limit, spread)
+    return Typical(seeds[best], int(rank[best, 0]) + 1, limit, spread)
 
 
 def rounded_up(value: float, digits: int = 2) -> float:
@@ -154,16 +162,42 @@ def readme(given: argparse.Namespace, found: Typical, limit: Limit, failed: int)
     )
 
 
-def outcomes_of(given: argparse.Namespace, plan: Plan) -> list[Outcome]:
+def scored(system: str, scene: Sequence[str]) -> dict[str, float]:
+    """What `simulate`, `track` and `evaluate` make of a scene; nothing where one of them fails."""
+    with TemporaryDirectory(prefix='sonar_imm_study_') as place, redirect_stdout(io.StringIO()):
+        bag, run = f'{place}/scene', f'{place}/run'
+        for words in (
+            ('simulate', system, bag, *scene),
+            ('track', bag, run),
+            ('evaluate', run, '--no-report'),
+        ):
+            if sonar_imm([*words]):
+                return {}
+        return finite_numbers(json.loads(Path(run, 'metrics.json').read_text(encoding='utf-8')))
+
+
+def finite_numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """Return the finite numbers among nested metrics by dotted name; True is 1."""
+    return {
+        name: float(value)
+        for name, value in flatten(metrics).items()
+        if isinstance(value, (bool, int, float)) and math.isfinite(value)
+    }
+
+
+def runs_of(given: argparse.Namespace) -> dict[int, dict[str, float]]:
+    """All runs, shared by processes with a thread each."""
     seeds = range(given.seed, given.seed + given.runs)
-    workers = min(given.workers or len(os.sched_getaffinity(0)), given.runs)
-    found = []
-    for outcome in run_seeds(plan, seeds, workers):
-        found.append(outcome)
-        text = outcome.failure or ', '.join(
-            f'{name} {outcome.metrics.get(name, math.nan):.3f}' for name in given.metric
-        )
-        print(f'seed {outcome.seed}: {text}', file=sys.stderr, flush=True)
+    os.environ.update(dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), '1'))
+    found: dict[int, dict[str, float]] = {}
+    with sharing(min(given.workers or len(os.sched_getaffinity(0)), given.runs)) as run:
+        calls = [(given.system, simulated(given, seed)) for seed in seeds]
+        for k, metrics, failure in run(scored, calls):
+            found[seeds[k]] = metrics or {}
+            text = failure or ', '.join(
+                f'{name} {found[seeds[k]].get(name, math.nan):.3f}' for name in given.metric
+            )
+            print(f'seed {seeds[k]}: {text}', file=sys.stderr, flush=True)
     return found
 
 
@@ -191,7 +225,6 @@ def main() -> None:
     parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE')
     parser.add_argument('--metric', action='append', default=[], help='the first has the limit')
     parser.add_argument('--workers', type=int, help='processes; by default one per core')
-    parser.add_argument('--out', type=Path, help='write the summary of all metrics here, as JSON')
     parser.add_argument('--write', type=Path, metavar='BAG', help='make the recording here')
     parser.add_argument(
         '--keep',
@@ -205,20 +238,16 @@ def main() -> None:
     given = parser.parse_args()
     limit = import_module(SYSTEMS[given.system].judge).LIMIT
     given.metric = given.metric or [limit.metric]
-    overrides = dict(pair.split('=', 1) for pair in given.set)
-    plan = planned(given.system, given.scene, overrides)
-    outcomes = outcomes_of(given, plan)
-    write_json(given.out, record(plan, outcomes))
-    failed = [outcome for outcome in outcomes if outcome.failure]
+    runs = runs_of(given)
+    failed = sum(not metrics for metrics in runs.values())
     try:
-        found = typical(outcomes, given.metric, given.keep)
+        found = typical(runs, given.metric, given.keep)
     except ValueError as error:
-        reasons = sorted({outcome.failure for outcome in failed})
-        sys.exit(' '.join([str(error), *reasons]))
+        sys.exit(str(error))
     print(markdown(found.spread))
-    print(f'seed {found.seed}, limit for check {found.limit:g} {limit.unit}, {len(failed)} failed')
+    print(f'seed {found.seed}, limit for check {found.limit:g} {limit.unit}, {failed} failed')
     if given.write:
-        write(given, found, readme(given, found, limit, len(failed)))
+        write(given, found, readme(given, found, limit, failed))
 
 
 if __name__ == '__main__':

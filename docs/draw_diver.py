@@ -8,8 +8,7 @@
 
 """Draw the pictures of the diver: python docs/draw_diver.py
 
-diver_paper.png   the paper's Figures 3 and 4, and diver_multistatic.png its Figures 6 and 7; their
-                  numbers go to docs/results/diver_figures.json
+diver_paper.png   the paper's Figures 3 and 4, and diver_multistatic.png its Figures 6 and 7
 
 Figures 3 and 6: one simulated dive, of Table 1 and before a multistatic sonar, with the tracks of
 both kinds of models in one picture. Figures 4 and 7: RMSE at each scan over several runs of that
@@ -35,7 +34,6 @@ from matplotlib import pyplot as plt  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 
 from benchmarks.diver_paper import track, tuned  # noqa: E402
-from benchmarks.study import write_json  # noqa: E402
 from sonar_imm.acoustics.localisation import localise  # noqa: E402
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian  # noqa: E402
 from sonar_imm.trackers.diver.tracker import DiverConfig  # noqa: E402
@@ -47,7 +45,6 @@ from sonar_imm_tools.simulation.diver.simulator import (  # noqa: E402
 )
 
 IMAGES = ROOT / 'docs' / 'images'
-FIGURES = ROOT / 'docs' / 'results' / 'diver_figures.json'
 DIVES = {
     'of Table 1': ('table1', 100, 'diver_paper.png', 3),
     'before a multistatic sonar': ('multistatic_fixes', 20, 'diver_multistatic.png', 6),
@@ -60,7 +57,6 @@ RANGE_STD, BEARING_STD = 0.1, np.radians(2.0)
 
 def main() -> None:
     plt.rcParams.update({'font.size': 11, 'axes.spines.top': False, 'axes.spines.right': False})
-    found = {}
     for name, (at, count, file, picture) in DIVES.items():
         path = simulate(scenario(at), SEED).truth[0].position[:, :2]
         z, R = OBSERVE[at](path, count)
@@ -78,12 +74,6 @@ def main() -> None:
         top.set(title=f'One dive {name} (Figure {picture})')
         bottom.set(title=f'RMSE of position, {count} runs (Figure {picture + 1})')
         figure.savefig(IMAGES / file, dpi=110)
-        found[name] = {
-            label: float(np.sqrt(np.mean(squared(runs, path))))
-            for label, (_, runs) in {'fixes': (PALE, z), **tracks}.items()
-        }
-    write_json(FIGURES, found)
-    print(found)
 
 
 def observe(path: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

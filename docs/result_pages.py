@@ -11,7 +11,7 @@
 Whole pages: ``docs/templates/NAME.md.j2`` makes ``docs/results/NAME.md``. Single tables in pages
 written by hand: ``docs/templates/tables/NAME.md.j2`` replaces the table with the same head.
 Templates take numbers by path, names joined by `>`: the first is the file below docs/results, the
-others lead to the number, as in ``diver_plain>scenes>ROV, .3 m/s>raw``.
+others lead to the number, as in ``diver_families>paths>legs, 1 m, 1>raw``.
 """
 
 from __future__ import annotations
@@ -153,8 +153,9 @@ class Numbers:
         return [name for name in self.at(path) if part in name] if self.has(path) else []
 
     def sources(self) -> str:
-        """Return one line with the files that were read so far and stand below no table."""
-        return '; '.join(map(self.made, sorted(self.files.keys() - self.captioned)))
+        """Return one line with the files that were read so far and stand below no table, if any."""
+        others = '; '.join(map(self.made, sorted(self.files.keys() - self.captioned)))
+        return others and f'<small>Numbers in the text: {others}</small>'
 
 
 def rendered(template: Path, folder: Path = RESULTS) -> str:

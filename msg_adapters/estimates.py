@@ -26,7 +26,7 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Rejection
 
 from .headers import head_of, Make, make_header, make_stated_pose, make_stated_twist
-from .table import decode_table, is_finite, layout_of, packed_table, require_columns
+from .table import decode_table, is_finite, layout_of, packed_table
 
 NOT_ESTIMATED = 1.0
 """Variance of a z or a vertical speed that is not estimated, m^2 and m^2/s^2: it says nothing, but
@@ -115,7 +115,6 @@ def read_estimate(message: Any) -> Estimate:
     Columns without a covariance, as in truth, come back as extras. Raises `Rejection`.
     """
     columns = decode_table(message)
-    require_columns(columns, ('x', 'y', 'z'), 'estimates')
     try:
         return Estimate.from_columns(columns, **head_of(message))
     except (ValueError, KeyError) as error:

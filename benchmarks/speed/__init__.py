@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Speed: what ``sonar-imm bench`` measures, beside FilterPy and Stone Soup in the same run.
+"""Speed: what ``sonar-imm bench`` measures, beside other programs in the same run.
 
     sonar-imm bench diver --rounds 5
 
@@ -24,7 +24,9 @@ from typing import Any
 
 from attrs import frozen
 
-PEERS = ('filterpy', 'stonesoup')
+from sonar_imm_tools.evaluation.numbers import flatten
+
+PEERS = ('filterpy',)
 """Libraries that a bench may need to compare with."""
 
 
@@ -34,12 +36,20 @@ class Bench:
 
     name: its key in the JSON. measure: takes the number of rounds, for what is measured in turn
     with another program, and gives plain numbers, with ``good`` where there is a goal; raises
-    ModuleNotFoundError when that program is not installed. sentence: the numbers for people.
+    ModuleNotFoundError when that program is not installed.
     """
 
     name: str
     measure: Callable[[int], dict[str, Any]]
-    sentence: Callable[[dict[str, Any]], str]
+
+
+def sentence(bench: Bench, result: dict[str, Any]) -> str:
+    """The numbers of a bench in one line."""
+    numbers = (
+        f'{name} {value:.4g}' if isinstance(value, float) else f'{name} {value}'
+        for name, value in flatten(result).items()
+    )
+    return f'{bench.name}: {", ".join(numbers)}'
 
 
 def seconds_of(function: Callable[..., Any], *arguments: Any) -> float:

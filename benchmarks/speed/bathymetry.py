@@ -6,44 +6,34 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""How fast the bathymetry tracker is, against other filters on the same pings in the same run.
+"""How fast the bathymetry tracker is, against the same filter in plain numpy on the same pings.
 
-All filters take the complex64 snapshots of the paper's scene and are timed in turn, round after
-round. The best round counts, because it is the least disturbed one. Of the tracker the whole of
-`process` is timed: variances, filter and estimate.
-
-`numpy_filter` is the IMM particle filter in plain numpy: all particles of a model at once, one bin
-after the other. `stone_soup_filter` is the multi-model particle filter of Stone Soup, another
-algorithm (one set of particles that carry their model) with the same likelihood and as many
-particles in all. Both suppose the scene of the paper, two random walks and noise of unit variance.
+Both take the complex64 snapshots of the paper's scene and are timed in turn, round after round.
+The best round counts, because it is the least disturbed one. Of the tracker the whole of `process`
+is timed: variances, filter and estimate. `numpy_filter` runs all particles of a model at once, one
+bin after the other; it supposes the scene of the paper, two random walks and noise of unit
+variance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from datetime import datetime, timedelta
-from functools import partial
 import math
-import time
 from typing import Any
 
 import numpy as np
 from scipy.special import kve
 
 from benchmarks.bathymetry_paper import WALKS
-from benchmarks.speed import Bench
+from benchmarks.speed import Bench, seconds_of
 from sonar_imm.acoustics.laplace import autocorrelation
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Snapshot
-from sonar_imm.trackers.bathymetry.ping import Look, look
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-from sonar_imm.trackers.bathymetry.two_surfaces import possible_bins, stretches
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 PEER_BINS = 400
 GOAL, GOAL_RATIO = 80_000, 30
-SEA_GOAL = 120_000
-RESOLVED_GOAL = 40_000
 
 Timed = tuple[Callable[[], Any], int]
 
@@ -112,62 +102,6 @@ def numpy_filter(ping: Snapshot, particles: int = 100, seed: int = 0) -> FloatAr
     return mean
 
 
-def stone_soup_filter(ping: Snapshot, particles: int = 200) -> FloatArray:
-    """Mean height (T,) by Stone Soup's multi-model particle filter. Raises ModuleNotFoundError."""
-    from stonesoup.base import Property
-    from stonesoup.models.measurement.base import MeasurementModel
-    from stonesoup.models.transition.linear import RandomWalk
-    from stonesoup.predictor.particle import MultiModelPredictor
-    from stonesoup.resampler.particle import SystematicResampler
-    from stonesoup.types.array import StateVectors
-    from stonesoup.types.detection import Detection
-    from stonesoup.types.hypothesis import SingleHypothesis
-    from stonesoup.types.state import MultiModelParticleState
-    from stonesoup.updater.particle import MultiModelParticleUpdater
-
-    class Likelihood(MeasurementModel):
-        """A detection is the number of its bin; the likelihood has the samples."""
-
-        likelihood: NumpyLikelihood = Property()
-        ndim_meas = 1
-
-        def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
-            raise NotImplementedError
-
-        def rvs(self, num_samples: int = 1, **kwargs: Any) -> Any:
-            raise NotImplementedError
-
-        def pdf(self, state1: Any, state2: Any, **kwargs: Any) -> Any:
-            return np.exp(self.logpdf(state1, state2))
-
-        def logpdf(self, state1: Any, state2: Any, **kwargs: Any) -> FloatArray:
-            heights = np.asarray(state2.state_vector[0, :], np.float64)
-            return self.likelihood.log_likelihood(int(state1.state_vector[0, 0]), heights)
-
-    # Stone Soup scales the variance with the time step, which is one second here.
-    predictor = MultiModelPredictor([RandomWalk(sigma**2) for sigma in SIGMAS], CHAIN, [[0], [0]])
-    model = Likelihood(ndim_state=1, mapping=(0,), likelihood=NumpyLikelihood(ping))
-    updater = MultiModelParticleUpdater(model, predictor, SystematicResampler())
-    np.random.seed(0)
-    start = datetime(2026, 1, 1)
-    state = MultiModelParticleState(
-        StateVectors(np.random.normal(size=(1, particles))),
-        weight=np.full(particles, 1.0 / particles),
-        dynamic_model=np.random.randint(0, 2, particles),
-        timestamp=start,
-    )
-    mean = np.empty(len(ping))
-    for t in range(len(ping)):
-        stamp = start + timedelta(seconds=t + 1)
-        prediction = predictor.predict(state, timestamp=stamp)
-        detection = Detection([t], timestamp=stamp)
-        state = updater.update(SingleHypothesis(prediction, detection))
-        mean[t] = float(np.mean(state.state_vector[0, :]))
-        state.hypothesis = None
-        state.parent = None
-    return mean
-
-
 def cut(ping: Snapshot, bins: int) -> Snapshot:
     """The first `bins` bins of a ping."""
     return Snapshot(
@@ -185,22 +119,15 @@ def a_ping(**values: Any) -> Snapshot:
     return ping
 
 
-def rates(
-    methods: Mapping[str, Timed],
-    rounds: int,
-    clock: Callable[[], float] | None = None,
-) -> dict[str, float]:
+def rates(methods: Mapping[str, Timed], rounds: int) -> dict[str, float]:
     """Bins per second of each method in the best of `rounds` rounds. `methods` maps a name to a
     function and the number of bins that it processes."""
-    clock = clock or time.perf_counter
     best = dict.fromkeys(methods, math.inf)
     for run, _ in methods.values():
         run()
     for _ in range(rounds):
         for name, (run, _) in methods.items():
-            begin = clock()
-            run()
-            best[name] = min(best[name], clock() - begin)
+            best[name] = min(best[name], seconds_of(run))
     return {name: bins / best[name] for name, (_, bins) in methods.items()}
 
 
@@ -236,114 +163,9 @@ def bench_numpy(rounds: int = 7) -> dict[str, Any]:
     }
 
 
-def bench_sea(rounds: int = 7) -> dict[str, Any]:
-    """Bins per second on a ship that moves, in CPU time: poses, rays through a profile, soundings'
-    uncertainties."""
-    timed, _ = under_way('moving_profile', {'last_range': 117.0}, WALKS)
-    speed = rates({'particles': timed}, rounds, clock=time.process_time)
-    return {
-        'bins_per_second': speed,
-        'wanted': SEA_GOAL,
-        'good': speed['particles'] >= SEA_GOAL,
-    }
-
-
-def under_way(
-    name: str, changes: Mapping[str, Any], values: Mapping[str, Any]
-) -> tuple[Timed, Look]:
-    """A tracker that knows the navigation of a scene, with its one ping; and what that holds."""
-    config = scenario(name, {'pings': 1, **changes})
-    measurements = [item.measurement for item in simulate(config, 1).measurements]
-    ping = next(item for item in measurements if isinstance(item, Snapshot))
-    stated = BathymetryConfig(**{**config.instruments(), **values})
-    inputs = {'snapshot', 'nav'} if config.moving else {'snapshot'}
-    tracker = BathymetryTracker(stated.for_inputs(frozenset(inputs)))
-    for measurement in measurements:
-        if measurement is not ping:
-            tracker.process(measurement)
-    (task,) = tracker.tasks(ping)
-    return (partial(tracker.process, ping), len(ping)), look(task)
-
-
-def bench_layover(rounds: int = 7) -> dict[str, Any]:
-    """Bins per second of CPU time with and without an object, at rest and on a ship that moves,
-    by what is made of bins with two surfaces; what a bin of a stretch costs."""
-    methods: dict[str, Timed] = {}
-    share = 0.0
-    for scene in ('thermal', 'ledge', 'moving_ledge'):
-        for layover in ('ignored', 'gated', 'resolved'):
-            changes = {'patch_std': 0.0} if scene == 'thermal' else {}
-            timed, seen = under_way(scene, changes, {**WALKS, 'layover': layover})
-            methods[f'{scene}, {layover}'] = timed
-            if scene == 'ledge' and seen.layover is not None:
-                possible = possible_bins(seen.ping.snapshot.iq, seen.layover)
-                parts = stretches(possible)
-                share = sum(end - first for first, end in parts) / timed[1]
-    speed = rates(methods, rounds, clock=time.process_time)
-    slow, fast = (speed[f'{scene}, resolved'] for scene in ('ledge', 'thermal'))
-    return {
-        'bins_per_second': speed,
-        'stretch_share': share,
-        'us_per_stretch_bin': 1e6 * (1.0 / slow - 1.0 / fast) / share,
-        'wanted': RESOLVED_GOAL,
-        'good': slow >= RESOLVED_GOAL,
-    }
-
-
-def bench_stone_soup(rounds: int = 7) -> dict[str, Any]:
-    """Bins per second of the tracker and of Stone Soup. Raises ModuleNotFoundError without it."""
-    short = cut(a_ping(), PEER_BINS)
-    peer: Timed = (lambda: stone_soup_filter(short), PEER_BINS)
-    speed = rates({'particles': engines(short)['particles'], 'stone_soup': peer}, min(rounds, 3))
-    return {'bins_per_second': speed, 'ratio': speed['particles'] / speed['stone_soup']}
-
-
 def _heights(ping: Snapshot) -> np.ndarray:
     tracker = BathymetryTracker(config(gate_false_alarm=1.0))
     return tracker.process(ping)[0].state[:, 0]
 
 
-def _numpy_sentence(result: Mapping[str, Any]) -> str:
-    speed = result['bins_per_second']
-    return (
-        f'two models, 100 particles each, 8 staves: {speed["particles"]:,.0f} bins/s (wanted '
-        f'{result["wanted"]:,}), with the coherence gate {speed["gated"]:,.0f}; numpy '
-        f'{speed["numpy"]:,.0f}: {result["ratio"]:.0f} times as fast (wanted '
-        f'{result["ratio_wanted"]}), {result["rms_difference_m"]:.3f} m apart (RMS)'
-    )
-
-
-def _sea_sentence(result: Mapping[str, Any]) -> str:
-    speed = result['bins_per_second']['particles']
-    return (
-        f'a moving ship and bent rays: {speed:,.0f} bins a second of CPU time (wanted '
-        f'{result["wanted"]:,})'
-    )
-
-
-def _layover_sentence(result: Mapping[str, Any]) -> str:
-    speed = result['bins_per_second']
-    each = ', '.join(
-        f'{name} {speed[f"ledge, {name}"]:,.0f}' for name in ('ignored', 'gated', 'resolved')
-    )
-    return (
-        f'a ping with a ledge, layover {each} bins a second of CPU time (wanted '
-        f'{result["wanted"]:,}); {result["us_per_stretch_bin"]:.0f} us per bin that may have two '
-        f'surfaces, {result["stretch_share"]:.0%} of them'
-    )
-
-
-def _stone_soup_sentence(result: Mapping[str, Any]) -> str:
-    speed = result['bins_per_second']
-    return (
-        f'Stone Soup, multi-model particle filter with as many particles: '
-        f'{speed["stone_soup"]:,.0f} bins/s: {result["ratio"]:.0f} times as fast'
-    )
-
-
-BENCHES = (
-    Bench('numpy', bench_numpy, _numpy_sentence),
-    Bench('sea', bench_sea, _sea_sentence),
-    Bench('layover', bench_layover, _layover_sentence),
-    Bench('stone_soup', bench_stone_soup, _stone_soup_sentence),
-)
+BENCHES = (Bench('numpy', bench_numpy),)

@@ -15,7 +15,7 @@ estimates have to agree, which shows that both did the same work.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import time
 from typing import Any
 
@@ -23,9 +23,8 @@ from attrs import evolve, frozen
 import numpy as np
 
 from benchmarks.speed import Bench, seconds_of
-from sonar_imm.estimation import bank, imm
-from sonar_imm.estimation.arrays import FloatArray, IndexArray
-from sonar_imm.estimation.association import assign, association_cost, gate_threshold
+from sonar_imm.estimation import bank
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.tracker import DiverTracker
@@ -35,7 +34,6 @@ MODELS, STATES, STEP = 16, 4, 1.0
 MANY = 20
 """Targets at once: ten divers and as many tentative tracks."""
 RATIO_WANTED = 3.0
-SCAN_WANTED_MS = 100.0
 CLUTTER_WANTED_MS = 0.3
 
 HEADINGS = DiverConfig(model_set='heading_speed')
@@ -84,41 +82,24 @@ def turn(rate: float) -> FloatArray:
 
 def run_bank(p: Problem, targets: int = 1) -> FloatArray:
     """(K, 4) estimates by our cycle in numpy, of the last of targets that do the same."""
-    block, mu = started(np.zeros((targets, STATES)), 10.0)
+    P = np.broadcast_to(10.0 * np.eye(STATES)[..., None], (targets, STATES, STATES, MODELS))
+    block = bank.Gaussians(np.zeros((targets, STATES, MODELS)), P)
+    mu = np.full((targets, MODELS), 1.0 / MODELS)
     steps, plain = p.moves, bank.Bank(np.zeros((2, MODELS)))
-    row, seen = np.arange(targets), np.zeros(targets)
+    row, seen, R = np.arange(targets), np.zeros(targets), np.broadcast_to(p.R, (targets, 2, 2))
     outputs = [np.repeat(np.eye(STATES)[..., None], MODELS, axis=2)]
     means = np.empty((len(p.z), STATES))
     for k, z in enumerate(p.z):
         (block,), c = bank.mix(plain, [block], mu, p.transition[None])
         block = bank.predict(block, steps)
-        block, mu = updated(block, c, row, np.tile(z, (targets, 1)), p.R, seen)
+        pairs = bank.weigh(block, row, np.tile(z, (targets, 1)), R)
+        log = np.log(c) + pairs.log
+        best = log.max(axis=1, keepdims=True)
+        total = best + np.log(np.exp(log - best).sum(axis=1, keepdims=True))
+        block, weight = bank.update(block, pairs, row, np.exp(pairs.log - total), seen)
+        mu = c * weight
         means[k] = bank.combine([block], mu, outputs)[0][-1]
     return means
-
-
-def started(x: FloatArray, variance: float) -> tuple[bank.Gaussians, FloatArray]:
-    """Targets at x (T, 4) under all models alike, and their model probabilities (T, M)."""
-    P = np.broadcast_to(variance * np.eye(STATES)[..., None], (len(x), STATES, STATES, MODELS))
-    block = bank.Gaussians(np.repeat(x[..., None], MODELS, axis=2), P)
-    return block, np.full((len(x), MODELS), 1.0 / MODELS)
-
-
-def updated(
-    block: bank.Gaussians,
-    c: FloatArray,
-    row: IndexArray,
-    z: FloatArray,
-    R: FloatArray,
-    missed: FloatArray,
-) -> tuple[bank.Gaussians, FloatArray]:
-    """Update the targets `row` (p,) by fixes z (p, 2); missed (T,) is 1 for the others."""
-    pairs = bank.weigh(block, row, z, np.broadcast_to(R, (len(row), 2, 2)))
-    log = np.log(c[row]) + pairs.log
-    best = log.max(axis=1, keepdims=True)
-    total = best + np.log(np.exp(log - best).sum(axis=1, keepdims=True))
-    block, weight = bank.update(block, pairs, row, np.exp(pairs.log - total), missed)
-    return block, c * weight
 
 
 def run_filterpy(p: Problem) -> FloatArray:
@@ -169,52 +150,6 @@ def bench_step(rounds: int = 7, steps: int = 150) -> dict[str, Any]:
     }
 
 
-def bench_scan(targets: int = 1000, scans: int = 20) -> dict[str, Any]:
-    """Milliseconds of a whole scan: mix, predict, gate, assign, update, combine."""
-    p = problem(1)
-    rng = np.random.default_rng(1)
-    side = 20.0 * np.sqrt(targets)
-    x = np.zeros((targets, STATES))
-    x[:, :2] = rng.uniform(0.0, side, (targets, 2))
-    block, mu = started(x, 1.0)
-    times, hits = [], []
-    for _ in range(scans + 1):
-        z = block.x[:, :2, 0] + rng.normal(0.0, 1.0, (targets, 2))
-        begin = time.perf_counter()
-        block, mu, hit = _scan(p, block, mu, z)
-        times.append(1e3 * (time.perf_counter() - begin))
-        hits.append(hit / targets)
-    median = float(np.median(times[1:]))
-    return {
-        'targets': targets,
-        'scans': scans,
-        'median_ms': median,
-        'worst_ms': float(np.max(times[1:])),
-        'assigned': float(np.mean(hits)),
-        'wanted_ms': SCAN_WANTED_MS,
-        'good': median <= SCAN_WANTED_MS,
-    }
-
-
-def _scan(
-    p: Problem, block: bank.Gaussians, mu: FloatArray, z: FloatArray
-) -> tuple[bank.Gaussians, FloatArray, int]:
-    """One scan of many targets, and how many of them were hit."""
-    targets = len(mu)
-    (block,), c = bank.mix(bank.Bank(np.zeros((2, MODELS))), [block], mu, p.transition[None])
-    block = bank.predict(block, p.moves)
-    expected, P = np.moveaxis(block.x[:, :2], -1, 1), np.moveaxis(block.P, -1, 1)
-    H, R = np.tile(p.H, (1, MODELS, 1, 1)), np.tile(p.R, (len(z), 1, 1))
-    fit = imm.gate(expected, H, P, c, z, R, gate_threshold(0.999, 2))
-    target, detection = imm.pairs_inside(fit)
-    cost = association_cost(fit[target, detection], 0.95, 1e-4)
-    chosen = assign(target, detection, cost, targets, len(z))
-    hit = np.flatnonzero(chosen >= 0)
-    block, mu = updated(block, c, hit, z[chosen[hit]], p.R, (chosen < 0).astype(np.float64))
-    bank.combine([block], mu, [np.repeat(np.eye(STATES)[..., None], MODELS, axis=2)])
-    return block, mu, len(hit)
-
-
 def bench_clutter(rounds: int = 7, scans: int = 200) -> dict[str, Any]:
     """CPU milliseconds that a whole tracker takes for a scan of four divers and three false fixes
     on average, with either association in turn."""
@@ -247,35 +182,4 @@ def _cpu_of_tracking(items: Sequence[Any], config: DiverConfig | None = None) ->
     return time.process_time() - begin
 
 
-def _step_sentence(step: Mapping[str, Any]) -> str:
-    return (
-        f'IMM step, {step["models"]} models, {step["states"]} states, {step["measurements"]} '
-        f'measurements: {step["ours_us"]:.0f} us, FilterPy {step["filterpy_us"]:.0f} us: '
-        f'{step["ratio"]:.1f} times as fast (wanted {step["ratio_wanted"]:.0f}; lowest of '
-        f'{step["rounds"]} paired rounds {step["ratio_lowest"]:.1f}); of {step["targets"]} '
-        f'targets at once {step["ours_each_us"]:.0f} us each: {step["ratio_each"]:.0f} times as '
-        f'fast; the estimates agree to {step["largest_difference_m"]:.0e} m'
-    )
-
-
-def _scan_sentence(scan: Mapping[str, Any]) -> str:
-    return (
-        f'scan of {scan["targets"]} targets with gating and assignment: median '
-        f'{scan["median_ms"]:.1f} ms (wanted {scan["wanted_ms"]:.0f}), worst of '
-        f'{scan["scans"]} {scan["worst_ms"]:.1f} ms'
-    )
-
-
-def _clutter_sentence(clutter: Mapping[str, Any]) -> str:
-    return (
-        f'tracker, CPU for a scan of 4 divers and 3 false fixes: {clutter["gnn_cpu_ms"]:.2f} ms '
-        f'with gnn, {clutter["jipda_cpu_ms"]:.2f} ms with jipda (wanted '
-        f'{clutter["wanted_ms"]:.1f}; median of {clutter["rounds"]} rounds)'
-    )
-
-
-BENCHES = (
-    Bench('step', bench_step, _step_sentence),
-    Bench('scan', lambda rounds: bench_scan(), _scan_sentence),
-    Bench('clutter', bench_clutter, _clutter_sentence),
-)
+BENCHES = Bench('step', bench_step), Bench('clutter', bench_clutter)

@@ -6,28 +6,19 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""How fast the reflector filter is, against the likelihood by least squares over the whole trace.
-
-A particle is cheap because its likelihood needs the response at its reflectors only, O(m^2). The
-textbook way fits the pulses to all N samples of the trace, O(N m^2). Both are timed in turn, and
-their values have to agree.
-"""
+"""How fast the reflector filter is: whole records of eight reflectors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.speed import Bench, seconds_of
-from sonar_imm.acoustics.fathometer import coherence, steering
+from benchmarks.speed import Bench
 from sonar_imm.acoustics.pulse import band_pulse
-from sonar_imm.acoustics.spectra import outer_sum, SnapshotStream
-from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import CrossSpectra, Trace
+from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 REFLECTORS, PARTICLES = 8, 20_000
@@ -88,132 +79,4 @@ def bench_record(records: int = 12) -> dict[str, Any]:
     }
 
 
-def bench_array(
-    rounds: int = 7, snapshots: int = 64, length: int = 16_800, hydrophones: int = 32
-) -> dict[str, Any]:
-    """Milliseconds from pressure to depth responses, for `snapshots` of `length` samples (90 s of
-    a real array): transforms, cross-spectra, the checks of their measurement, the processors."""
-    rng = np.random.default_rng(0)
-    blocks = rng.standard_normal((snapshots, length, hydrophones), np.float32)
-    band = slice(length // 240, length // 3)
-
-    def transform() -> np.ndarray:
-        stream = SnapshotStream(length, length, band)
-        return np.concatenate([stream.push(block) for block in blocks])
-
-    spectra = transform()
-    R = outer_sum(spectra) / np.float32(snapshots)
-    frequency = np.arange(band.start, band.stop) / 1.4
-    w = steering(frequency, 0.18 * np.arange(hydrophones), 1500.0)
-    works: dict[str, Callable[[], Any]] = {
-        'transforms': transform,
-        'cross-spectra': lambda: outer_sum(spectra),
-        'their checks': lambda: CrossSpectra(stamp_ns=1, frequency=frequency, csdm=R),
-        **{name: partial(coherence, R, w, name) for name in ('conventional', 'mvdr')},
-    }
-    times = {
-        name: float(np.median([seconds_of(work) for _ in range(min(rounds, 3))]))
-        for name, work in works.items()
-    }
-    times['white_noise'] = seconds_of(coherence, R, w, 'white_noise')
-    return {'snapshots': snapshots, 'ms': {name: 1e3 * spent for name, spent in times.items()}}
-
-
-def bench_likelihood(rounds: int = 7, sets: int = 100) -> dict[str, Any]:
-    """Microseconds of the log likelihood ratio of one set of eight reflectors, in plain numpy:
-    from G and b at their depths, and by least squares over the trace. Also those of a whole
-    particle of the tracker."""
-    rng = np.random.default_rng(1)
-    lattice = np.asarray(STEP * np.arange(SAMPLES))
-    pulse = band_pulse(50.0, 4000.0, 1500.0)
-    shapes = whitened_pulses(pulse, lattice)
-    x = rng.standard_normal(len(shapes))
-    b = shapes.T @ x
-    gram = shapes.T @ shapes
-    places = np.sort(rng.permuted(np.tile(np.arange(20, 1580, 24), (sets, 1)), axis=1)[:, :8])
-    short, full = _by_gram(b, gram, places), _by_least_squares(x, shapes, places)
-    pairs = np.array(
-        [
-            [
-                seconds_of(_by_gram, b, gram, places),
-                seconds_of(_by_least_squares, x, shapes, places),
-            ]
-            for _ in range(rounds)
-        ]
-    )
-    us = pairs / sets * 1e6
-    particle = bench_record(4)['us_a_particle']
-    return {
-        'sets': sets,
-        'samples': len(x),
-        'rounds': rounds,
-        'gram_numpy_us': float(np.median(us[:, 0])),
-        'least_squares_numpy_us': float(np.median(us[:, 1])),
-        'particle_us': particle,
-        'ratio': float(np.median(us[:, 1])) / particle,
-        'largest_relative_difference': float(np.abs(short / full - 1.0).max()),
-        'good': bool(np.allclose(short, full, rtol=1e-6)),
-    }
-
-
-def whitened_pulses(pulse: Any, lattice: FloatArray) -> FloatArray:
-    """Signature of each depth in the data before they are correlated with the pulse, one column
-    per depth: the square root of the pulse's spectrum, so that the Gram matrix is that of the
-    pulse."""
-    length, step = len(lattice), float(lattice[1] - lattice[0])
-    size = length + 200  # a circle with some room between its ends
-    lags = step * np.minimum(np.arange(size), size - np.arange(size))
-    spectrum = np.fft.rfft(pulse(lags)).real.clip(min=0.0)
-    half = np.fft.irfft(np.sqrt(spectrum), size)
-    index = (np.arange(size)[:, None] - np.arange(length)[None, :]) % size
-    return np.ascontiguousarray(half[index])
-
-
-def _by_gram(b: FloatArray, gram: FloatArray, places: np.ndarray) -> FloatArray:
-    """b^T G^-1 b / 2 of each set."""
-    values = np.empty(len(places))
-    for k, z in enumerate(places):
-        values[k] = 0.5 * b[z] @ np.linalg.solve(gram[np.ix_(z, z)], b[z])
-    return values
-
-
-def _by_least_squares(x: FloatArray, shapes: FloatArray, places: np.ndarray) -> FloatArray:
-    """Half of the decrease of the residual sum of squares by fitting each set to all samples."""
-    values = np.empty(len(places))
-    for k, z in enumerate(places):
-        A = shapes[:, z]
-        fit = A @ np.linalg.lstsq(A, x, rcond=None)[0]
-        values[k] = 0.5 * (x @ x - np.sum(np.square(x - fit)))
-    return values
-
-
-def _record_sentence(result: Mapping[str, Any]) -> str:
-    each = ', '.join(
-        f'{name} {median:.1f} ms (worst {result["worst_ms"][name]:.1f} ms)'
-        for name, median in result['median_ms'].items()
-    )
-    return (
-        f'a record, {result["particles"]} particles, {result["reflectors"]["defaults"]} '
-        f'reflectors: {each}; wanted: at most {result["wanted_ms"]:g} ms'
-    )
-
-
-def _likelihood_sentence(result: Mapping[str, Any]) -> str:
-    return (
-        f'likelihood of 8 reflectors: numpy over {result["samples"]} samples '
-        f'{result["least_squares_numpy_us"]:.0f} us, numpy at the reflectors '
-        f'{result["gram_numpy_us"]:.1f} us, a whole particle of the tracker '
-        f'{result["particle_us"]:.2f} us: {result["ratio"]:.0f} times less than the first'
-    )
-
-
-def _array_sentence(result: Mapping[str, Any]) -> str:
-    each = ', '.join(f'{name} {spent:,.0f} ms' for name, spent in result['ms'].items())
-    return f'{result["snapshots"]} snapshots of 32 hydrophones: {each}'
-
-
-BENCHES = (
-    Bench('record', lambda rounds: bench_record(), _record_sentence),
-    Bench('likelihood', bench_likelihood, _likelihood_sentence),
-    Bench('array', bench_array, _array_sentence),
-)
+BENCHES = (Bench('record', lambda rounds: bench_record()),)

@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 import time
 from typing import Any
 
@@ -25,15 +24,6 @@ OBSTACLES = 16
 FALSE, WANTED_MS, WANTED_FALSE_MS = 30, 15.0, 30.0
 """False echoes a ping, and goals without and with them: plain numpy, without a compiler."""
 STEP_NS = 500_000_000
-
-
-VARIANTS: dict[str, tuple[int, dict[str, Any]]] = {
-    'fixed obstacles alone': (0, {'behaviours': ('fixed',)}),
-    'misses as evidence': (0, {'misses': 'evidence'}),
-    '5 slices instead of 9': (0, {'components': 5}),
-    'two_way timing': (0, {'ping_timing': 'two_way', 'max_extrapolation': 0.2}),
-}
-"""False echoes per ping and parameters of what is measured beside the default."""
 
 
 def bench_ping(
@@ -66,16 +56,6 @@ def bench_ping(
 def bench_clutter(rounds: int = 7) -> dict[str, Any]:
     """Milliseconds as in `bench_ping`, with false echoes all over."""
     return bench_ping(rounds, clutter=FALSE, wanted_ms=WANTED_FALSE_MS)
-
-
-def bench_variants(rounds: int = 7, pings: int = 40) -> dict[str, Any]:
-    """Milliseconds per ping as in `bench_ping`, for what costs more or less than the default."""
-    return {
-        'median_ms': {
-            name: bench_ping(min(rounds, 3), pings, clutter=clutter, **values)['median_ms']
-            for name, (clutter, values) in VARIANTS.items()
-        }
-    }
 
 
 def _approach(
@@ -118,21 +98,4 @@ def _approach(
     return times, confirmed
 
 
-def _sentence(result: Mapping[str, Any]) -> str:
-    return (
-        f'{result["obstacles"]} obstacles and {result["false"]} false echoes per ping, '
-        f'association included: '
-        f'{result["median_ms"]:.2f} ms of CPU, p99 {result["p99_ms"]:.2f} ms '
-        f'(wanted {result["wanted_ms"]:.0f}), {result["tracked"]:.0f} of them tracked'
-    )
-
-
-def _variants_sentence(result: Mapping[str, Any]) -> str:
-    return ', '.join(f'{name} {spent:.2f} ms' for name, spent in result['median_ms'].items())
-
-
-BENCHES = (
-    Bench('ping', bench_ping, _sentence),
-    Bench('clutter', bench_clutter, _sentence),
-    Bench('variants', bench_variants, _variants_sentence),
-)
+BENCHES = Bench('ping', bench_ping), Bench('clutter', bench_clutter)

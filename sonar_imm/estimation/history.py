@@ -37,7 +37,8 @@ late item is put in its place and everything after it is computed again. What it
 the newest stamp alone, never on the order of arrival: the scans not older than ``newest -
 window``, and one *base* state, that after the last older scan. An item that is still accepted is
 never older than ``newest - window``, so no scan before the base can change any more, and **input
-shuffled inside the window gives the same bits as sorted input**.
+shuffled inside the window gives the same bits as sorted input**. Where a window holds very many
+scans, only some of the older states are kept; the others are computed again when they are needed.
 
 Times are integer nanoseconds; there is no clock here.
 """
@@ -257,7 +258,9 @@ class ReplayHistory(Generic[State, Item]):
     initial: the state before the first scan. States must be values: `step` makes a new one and
     leaves the old one alone. window_ns: how late an item may be; 0 drops all late ones, and items
     of the newest stamp still join its scan. scan_limit: most items of one stamp, so that a clock
-    that stands still cannot eat the memory. STATE: see `trackers.Tracker`; `again` makes the rest.
+    that stands still cannot eat the memory. state_limit: most states that are kept, so that many
+    scans in a window cannot either; at least 4, None for all. STATE: see `trackers.Tracker`;
+    `again` makes the rest.
     """
 
     STATE: ClassVar = ('_base', '_stamps', '_scans')
@@ -265,14 +268,18 @@ class ReplayHistory(Generic[State, Item]):
     _base: State = field(alias='initial')
     window_ns: int
     scan_limit: int = field(kw_only=True, default=10_000)
+    state_limit: int | None = field(kw_only=True, default=None)
     _stamps: list[int] = field(init=False, factory=list)
     _scans: list[list[Item]] = field(init=False, factory=list)
     _keys: list[list[bytes]] = field(init=False, factory=list)
-    _states: list[State] = field(init=False, factory=list)
+    _states: dict[int, State] = field(init=False, factory=dict)
+    """By stamp, rising: the newest half of what may be kept without a gap, and some before it."""
 
     def __attrs_post_init__(self) -> None:
         if self.window_ns < 0 or self.scan_limit < 1:
             raise ValueError('a history needs window_ns >= 0 and scan_limit >= 1')
+        if self.state_limit is not None and self.state_limit < 4:
+            raise ValueError('a history needs state_limit >= 4')
 
     def __len__(self) -> int:
         """How many scans are kept."""
@@ -286,7 +293,7 @@ class ReplayHistory(Generic[State, Item]):
     @property
     def state(self) -> State:
         """The state after the newest scan."""
-        return self._states[-1] if self._states else self._base
+        return self._states[self._stamps[-1]] if self._stamps else self._base
 
     @property
     def base(self) -> State:
@@ -295,8 +302,8 @@ class ReplayHistory(Generic[State, Item]):
 
     @property
     def states(self) -> list[State]:
-        """The state after each scan that is kept, oldest first."""
-        return list(self._states)
+        """The state after each scan for which one is kept, oldest first."""
+        return list(self._states.values())
 
     def insert(
         self, stamp_ns: int, key: bytes, item: Item, step: Step[State, Item]
@@ -317,15 +324,18 @@ class ReplayHistory(Generic[State, Item]):
             return Inserted('duplicate', [])
         if len(items) >= self.scan_limit:
             return Inserted('full', [])
+        scan = [*items[:row], item, *items[row:]]
         later = place + merged
-        stamps = [stamp_ns, *self._stamps[later:]]
-        scans = [[*items[:row], item, *items[row:]], *self._scans[later:]]
-        before = self._states[place - 1] if place else self._base
-        states = self._replay(before, stamps, scans, step)
-        self._stamps[place:], self._scans[place:], self._states[place:] = stamps, scans, states
+        first, before = self._kept_before(place)
+        stamps = [*self._stamps[first:place], stamp_ns, *self._stamps[later:]]
+        scans = [*self._scans[first:place], scan, *self._scans[later:]]
+        states = self._replay(before, stamps, scans, step)[place - first :]
+        self._stamps[place:later], self._scans[place:later] = [stamp_ns], [scan]
         self._keys[place:later] = [[*keys[:row], key, *keys[row:]]]
+        revised = list(zip(stamps[place - first :], states))
+        self._keep(revised)
         self._prune()
-        return Inserted('used', list(zip(stamps, states)))
+        return Inserted('used', revised)
 
     def again(self, key: Callable[[Item], bytes], step: Step[State, Item]) -> None:
         """Compute the keys and the states of all scans, after a state was put in. Raises
@@ -334,7 +344,9 @@ class ReplayHistory(Generic[State, Item]):
         rising = all(map(operator.lt, stamps, stamps[1:]))
         if not rising or len(stamps) != len(keys) or any(scan != sorted(scan) for scan in keys):
             raise ValueError('scans that are in no order')
-        self._keys, self._states = keys, self._replay(self._base, stamps, self._scans, step)
+        states = self._replay(self._base, stamps, self._scans, step)
+        self._keys, self._states = keys, {}
+        self._keep(list(zip(stamps, states)))
 
     @staticmethod
     def _replay(
@@ -346,11 +358,32 @@ class ReplayHistory(Generic[State, Item]):
             states.append(state)
         return states
 
+    def _kept_before(self, place: int) -> tuple[int, State]:
+        """The newest state that is kept before scan `place`, and the scan after it."""
+        for row in range(place - 1, -1, -1):
+            if (state := self._states.get(self._stamps[row])) is not None:
+                return row + 1, state
+        return 0, self._base
+
+    def _keep(self, revised: list[tuple[int, State]]) -> None:
+        """Take over the newest states; of those before, every second one goes while there are too
+        many."""
+        for stamp_ns in self._stamps[len(self._stamps) - len(revised) :]:
+            self._states.pop(stamp_ns, None)
+        self._states.update(revised)
+        limit = self.state_limit
+        while limit is not None and len(self._states) > limit:
+            older = list(self._states)[: -(limit // 2)]
+            for stamp_ns in older[::2]:
+                del self._states[stamp_ns]
+
     def _prune(self) -> None:
-        """Forget scans older than the window; the state after the last of them becomes the base.
+        """Forget scans older than the window; the state after the last of them becomes the base,
+        or the last one that is kept.
 
         The edge itself stays: an item with exactly that stamp may still come."""
         old = bisect_left(self._stamps, self._stamps[-1] - self.window_ns)
-        if old:
-            self._base = self._states[old - 1]
-            del self._stamps[:old], self._keys[:old], self._scans[:old], self._states[:old]
+        old, self._base = self._kept_before(old)
+        for stamp_ns in self._stamps[:old]:
+            self._states.pop(stamp_ns, None)
+        del self._stamps[:old], self._keys[:old], self._scans[:old]

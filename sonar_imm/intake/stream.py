@@ -39,6 +39,8 @@ from ..measurements import nanoseconds, Rejection, VesselPose
 
 State = TypeVar('State')
 TRACKS = 'tracks'
+_MOST_STATES = 64
+"""States that a stream keeps: with many tracks one of the divers has 2 MB."""
 
 
 def frame_key(measurement: Any) -> str | None:
@@ -224,7 +226,7 @@ class ReplayStream(Stream, Generic[State]):
 
     def __attrs_post_init__(self) -> None:
         Stream.__attrs_post_init__(self)
-        self._history = ReplayHistory(self.initial, self._rules.window_ns)
+        self._history = self._begun(self.initial)
 
     def restored(self) -> None:
         """Compute the states anew, after the scans were put in. Raises ValueError."""
@@ -242,7 +244,10 @@ class ReplayStream(Stream, Generic[State]):
 
     def forget(self) -> None:
         """Forget all measurements, but for what survives of the state."""
-        self._history = ReplayHistory(self._survivor(self.state), self._rules.window_ns)
+        self._history = self._begun(self._survivor(self.state))
+
+    def _begun(self, state: State) -> ReplayHistory[State, Any]:
+        return ReplayHistory(state, self._rules.window_ns, state_limit=_MOST_STATES)
 
     def revise(self, measurement: Any) -> list[tuple[int, State]]:
         """Take a measurement in: every stamp with a new or a changed state, and that state, oldest

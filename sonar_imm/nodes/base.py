@@ -190,7 +190,10 @@ class BaseNode(ManagedNode):
                 raise  # the middleware went away under our feet: `run` knows
             self._recover(name)
         if stamp is not None:
-            age = start - (stamp.sec + 1e-9 * stamp.nanosec)
+            # From its reception on: the wait in a full queue would blur whose stamps are whose.
+            queued = (time.time_ns() - self._received_ns) * 1e-9 if self._received_ns else 0.0
+            arrival = time.monotonic() - queued
+            age = arrival - (stamp.sec + 1e-9 * stamp.nanosec)
             used = unused == self.unused()
             self._meter.stamped(name, Stamp(age, message.header.frame_id, used))
         self._acknowledge(stamp)

@@ -93,7 +93,7 @@ def _measure(speed: ModuleType, system: str, rounds: int, *, quiet: bool) -> dic
                 quiet=quiet,
             )
         else:
-            say(f'  {bench.sentence(result[bench.name])}', quiet=quiet)
+            say(f'  {speed.sentence(bench, result[bench.name])}', quiet=quiet)
     return result
 
 

@@ -65,7 +65,7 @@ def command(
             listener = TableListener(link, topics)
             announced: list[str] = []
             for table in listener.tables(timeout):
-                # With the first table, or a look after subscribing: publishers know of it by then.
+                # With the first table, or a look after it subscribed: publishers know it then.
                 if listener.topics != announced and not sys.stdout.isatty():
                     announced = listener.topics
                     warn(f'listening to {", ".join(announced)}')

@@ -6,25 +6,34 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Envelopes of profilers: noise, pulse and normal numbers, against vectors and closed forms."""
+"""Envelopes of profilers, pulses, cross-spectra against vectors, closed forms and scipy."""
+
+import json
+from pathlib import Path
 
 from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
+from scipy.signal import csd
 from scipy.stats import norm
 
-from sonar_imm.acoustics.envelopes import (
-    first_noise,
-    from_normal,
-    is_envelope,
-    log_likelihoods,
-    pulse_and_lead,
-    quietest,
-    rise,
-    scatter_power,
-    to_normal,
-    transmit_samples,
-    water_noise,
+from sonar_imm.acoustics import envelopes
+from sonar_imm.acoustics.envelopes import from_normal, pulse_and_lead, rise, to_normal
+from sonar_imm.acoustics.pulse import (
+    band_pulse,
+    gaussian_pulse,
+    gram,
+    independent_samples,
+    measured_pulse,
+)
+from sonar_imm.acoustics.spectra import (
+    BlockAverage,
+    noise_taper,
+    outer_sum,
+    SlidingAverage,
+    SnapshotStream,
+    window_of,
+    window_overlap,
 )
 
 
@@ -35,15 +44,15 @@ def vectors():
 
 def test_tables_of_the_vectors(vectors):
     trace, step = vectors['trace'], float(vectors['step'])
-    assert transmit_samples(trace) == vectors['ring_look']
-    noise = first_noise(trace)
+    assert envelopes.transmit_samples(trace) == vectors['ring_look']
+    noise = envelopes.first_noise(trace)
     assert noise == pytest.approx(vectors['noise_profile'], rel=1e-6)
     pulse, _, _ = pulse_and_lead(trace, vectors['first_onset'])
     assert step * pulse == pytest.approx(float(vectors['pulse']), rel=1e-6)
     # The transmit pulse of the first pass ends at 31 in most traces.
-    found = water_noise(trace, noise, 31, vectors['first_onset'], pulse)
+    found = envelopes.water_noise(trace, noise, 31, vectors['first_onset'], pulse)
     assert found == pytest.approx(vectors['water_profile'], rel=1e-6)
-    logs = log_likelihoods(trace[0], found, float(vectors['loudest']))
+    logs = envelopes.log_likelihoods(trace[0], found, float(vectors['loudest']))
     for log, name in zip(logs, ('log_quiet', 'log_loud', 'log_onset')):
         assert log == pytest.approx(vectors[name], abs=1e-6)
 
@@ -92,12 +101,12 @@ def test_scatter_begins_below_the_floor():
     rng, cell = np.random.default_rng(1), np.arange(400)
     level = 5.0 * np.exp(-(cell - 100) / 60.0) * (cell > 100)
     trace = np.hypot(*(np.sqrt(0.5) * rng.standard_normal((2, 400)))) * np.hypot(1.0, level)
-    power = scatter_power(trace, np.ones(400), 100, 2.5)
+    power = envelopes.scatter_power(trace, np.ones(400), 100, 2.5)
     assert (power >= 0.0).all() and (np.diff(power) <= 0.0).all()
     # Four pulses, 10 samples, below the onset; of a single trace a little less than it is.
     assert power[20] == pytest.approx(level[130] ** 2, rel=0.6)
     assert power[250] < 2.0 and power[290:].max() == 0.0
-    assert not scatter_power(trace, np.ones(400), 395, 2.5).any()
+    assert not envelopes.scatter_power(trace, np.ones(400), 395, 2.5).any()
 
 
 def test_missing_samples_say_nothing():
@@ -105,14 +114,167 @@ def test_missing_samples_say_nothing():
     traces = rng.rayleigh(1.0, (60, 100))
     traces[:, :10] = np.nan
     traces[::2, 80:] = np.nan
-    noise = first_noise(traces)
+    noise = envelopes.first_noise(traces)
     assert np.isfinite(noise).all() and noise[50] == pytest.approx(np.sqrt(2.0), rel=0.5)
-    logs = log_likelihoods(traces[0], noise, 5.0)
+    logs = envelopes.log_likelihoods(traces[0], noise, 5.0)
     assert all((log[:10] == 0.0).all() and log[20] != 0.0 for log in logs)
-    assert transmit_samples(np.nan_to_num(traces, nan=9.0)) >= 10
+    assert envelopes.transmit_samples(np.nan_to_num(traces, nan=9.0)) >= 10
 
 
 def test_what_is_an_envelope():
     trace = np.array([0.0, 1.0, np.nan, 2.0])
-    assert is_envelope(trace) and not is_envelope(-trace) and not is_envelope(0.0 * trace)
-    assert quietest(trace) > 0.0
+    assert (
+        envelopes.is_envelope(trace)
+        and not envelopes.is_envelope(-trace)
+        and not envelopes.is_envelope(0.0 * trace)
+    )
+    assert envelopes.quietest(trace) > 0.0
+
+
+# -- pulses and what follows from them ------------------------------------------------------------
+
+GOLDEN = Path(__file__).parents[1] / 'vectors' / 'fathometer' / 'golden.json'
+
+
+def test_band_pulse_is_the_golden_one():
+    wanted = json.loads(GOLDEN.read_text())['pulse lattice lag 4,20,100 (50-4000) vs closed form']
+    pulse = band_pulse(50.0, 4000.0, 1500.0)
+    assert pulse(np.array([4, 20, 100]) / 64.0) == pytest.approx(wanted[1], abs=1e-12)
+    assert pulse(0.0) == 1.0
+    fine = np.linspace(0.0, 0.2, 20_001)
+    assert fine[np.argmax(pulse(fine) < 0.0)] == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_gram_matrix_is_one_of_inner_products():
+    for pulse in (band_pulse(200.0, 4000.0, 1500.0), gaussian_pulse(0.3)):
+        G = gram(pulse, [1.0, 1.4, 2.2, 9.0])
+        assert np.array_equal(G, G.T)
+        assert np.linalg.eigvalsh(G)[0] > 0.0
+        assert np.diag(G) == pytest.approx(1.0)
+
+
+def test_a_band_has_two_b_t_independent_samples():
+    pulse = band_pulse(50.0, 4000.0, 1500.0)
+    assert independent_samples(pulse, 50.0, 0.005) == pytest.approx(527.0, rel=0.01)
+
+
+def test_a_measured_pulse_is_even_and_scaled():
+    pulse = measured_pulse([-0.2, -0.1, 0.0, 0.1, 0.2], [0.0, 2.2, 4.0, 1.8, 0.0])
+    assert pulse(np.array([0.0, 0.1, -0.1, 0.15, 3.0])) == pytest.approx(
+        [1.0, 0.5, 0.5, 0.25, 0.0]
+    )
+    assert measured_pulse([0.0, 1.0], [1.0, 0.0])(0.25) == pytest.approx(0.75)
+
+
+def test_what_is_no_pulse_is_refused():
+    ends = [1.0, 0.0]
+    for distance, value in (
+        ([0.0], [1.0]),
+        ([0.0, 1.0], [1.0]),
+        ([0.5, 1.0], ends),
+        ([0.0, 1.0], [-1.0, 0.0]),
+        ([0.0, 1.0], [0.0, 1.0]),
+        ([0.0, np.nan], ends),
+    ):
+        with pytest.raises(ValueError):
+            measured_pulse(distance, value)
+    with pytest.raises(ValueError):
+        band_pulse(4000.0, 50.0, 1500.0)
+    with pytest.raises(ValueError):
+        gaussian_pulse(0.0)
+
+
+# -- streaming cross-spectra against scipy's, whatever the blocks ---------------------------------
+
+LENGTH, HYDROPHONES = 64, 4
+
+
+def pressure(samples=1000, seed=0):
+    rng = np.random.default_rng(seed)
+    shared = rng.standard_normal((samples, 1))
+    return (shared + rng.standard_normal((samples, HYDROPHONES))).astype(np.float32)
+
+
+def spectra_of(p, cuts=()):
+    stream = SnapshotStream(LENGTH, LENGTH // 2, slice(3, 20))
+    return np.concatenate([stream.push(block) for block in np.split(p, cuts)])
+
+
+def test_the_average_is_the_cross_spectrum_scipy_finds():
+    p = pressure()
+    spectra = spectra_of(p)
+    R = outer_sum(spectra) / len(spectra)
+    for i, j in ((0, 0), (0, 2), (3, 1)):
+        # scipy conjugates the first of the two, and scales to a density.
+        _, expected = csd(
+            p[:, j], p[:, i], nperseg=LENGTH, noverlap=LENGTH // 2, detrend=False, fs=1.0
+        )
+        assert R[:, i, j] * 2.0 / LENGTH == pytest.approx(expected[3:20], rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize('cuts', [(1,), (63, 64, 65), (500,), tuple(range(7, 1000, 7))])
+def test_blocks_may_be_cut_anywhere(cuts):
+    p = pressure()
+    assert spectra_of(p, cuts).tobytes() == spectra_of(p).tobytes()
+
+
+def test_a_restart_forgets_half_a_snapshot():
+    stream = SnapshotStream(LENGTH, LENGTH, slice(0, 5), 'rectangular')
+    stream.push(pressure(LENGTH - 1))
+    assert stream.waiting == LENGTH - 1
+    stream.restart()
+    assert len(stream.push(pressure(LENGTH - 1))) == 0
+    with pytest.raises(ValueError):
+        stream.push(np.zeros((5, HYDROPHONES + 1)))
+
+
+def test_windows_have_unit_power_and_the_autocorrelation_they_claim():
+    for name in ('hann', 'rectangular'):
+        window = window_of(name, 4096)
+        assert np.mean(window**2) == pytest.approx(1.0)
+        for share in (0.0, 0.1, 0.5, 0.9):
+            lag = round(share * 4096)
+            seen = np.sum(window[lag:] * window[: 4096 - lag]) / 4096
+            assert window_overlap(name, lag / 4096) == pytest.approx(seen, abs=1e-3)
+        assert window_overlap(name, 1.5) == pytest.approx(0.0, abs=1e-12)
+    with pytest.raises(ValueError):
+        window_of('kaiser', 8)
+
+
+def test_spectra_of_nothing():
+    assert BlockAverage(3).push(np.empty((0, 5, 4), np.complex64)) == []
+    with pytest.raises(ValueError):
+        SnapshotStream(8, 9, slice(0, 2))
+    with pytest.raises(ValueError):
+        SlidingAverage(3, 4)
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize('window, overlap', [('hann', 0.5), ('rectangular', 0.5), ('hann', 0.75)])
+def test_the_taper_of_noise_is_that_of_correlated_noise(window, overlap):
+    """Two unrelated noises, correlated by averaged cross-spectra, many times over."""
+    rng = np.random.default_rng(2)
+    n, total = 64, np.zeros(64)
+    for _ in range(1500):
+        stream = SnapshotStream(n, round(n * (1.0 - overlap)), slice(None), window)
+        spectra = stream.push(rng.standard_normal((12 * n, 2)))
+        total += np.fft.irfft(np.mean(spectra[:, :, 0] * spectra[:, :, 1].conj(), axis=0), n) ** 2
+    lags = np.arange(4, 60, 8)
+    taper = noise_taper(window, overlap, lags / n)
+    assert np.sqrt(total[lags] / total[0]) == pytest.approx(taper, rel=0.12, abs=0.01)
+    assert taper.min() < 0.8
+
+
+def test_averages_are_of_the_snapshots_they_say():
+    """Those of blocks share no sample, those that slide are of the last ones."""
+    spectra = spectra_of(pressure())
+    blocks, sliding = BlockAverage(5, 1), SlidingAverage(10, 4)
+    done = [made for part in np.split(spectra, [1, 8, 9]) for made in blocks.push(part)]
+    assert len(done) == (len(spectra) + 1) // 6
+    for k, made in enumerate(done):
+        assert made.csdm == pytest.approx(outer_sum(spectra[6 * k : 6 * k + 5]) / 5, rel=1e-5)
+        assert made.snapshots == 5
+    done = [made for part in np.split(spectra, [3, 11]) for made in sliding.push(part)]
+    assert len(done) == (len(spectra) - 10) // 4 + 1
+    for k, made in enumerate(done):
+        assert made.csdm == pytest.approx(outer_sum(spectra[4 * k : 4 * k + 10]) / 10, rel=1e-5)

@@ -6,35 +6,24 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
+"""Directions of an array: steering, likelihoods, coherence against definitions, closed forms."""
+
 import math
 
 import numpy as np
-from oracles.array_likelihood import gaussian_log_density, log_likelihood
+from oracles.array_likelihood import interfered_log_likelihood, log_likelihood
 from oracles.bin_likelihood import log_densities, log_likelihoods
 import pytest
 from scipy.integrate import quad
 from scipy.special import kve
 
-from sonar_imm.acoustics import array, laplace
+from sonar_imm.acoustics import array, coherence, interference, laplace, wave_kernels
 
 STEP = array.phase_step(0.5)
 
 
 def complex_normal(rng, *shape):
     return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / math.sqrt(2.0)
-
-
-@pytest.mark.parametrize(
-    'staves, q, value',
-    [
-        (8, 1.0, 5.7220742150),
-        (8, 8.0, -9.8732948088),
-        (8, 1e4, -234.5379989984),
-        (4, 1.0, -0.4348135035),
-    ],
-)
-def test_golden_values(staves, q, value):
-    assert laplace.log_density(q, staves) == pytest.approx(value, abs=1e-9)
 
 
 @pytest.mark.parametrize('staves', [2, 3, 4, 8, 16, 64])
@@ -78,7 +67,7 @@ def test_both_laws_integrate_to_one(staves):
         return quad(shells, 0.0, 10.0, limit=200)[0] + quad(shells, 10.0, 80.0, limit=200)[0]
 
     assert total(laplace.log_density, constant) == pytest.approx(1.0, abs=1e-8)
-    assert total(gaussian_log_density, gaussian) == pytest.approx(1.0, abs=1e-8)
+    assert total(lambda q, _: -q, gaussian) == pytest.approx(1.0, abs=1e-8)
 
 
 @pytest.mark.parametrize('constant', [laplace.log_constant, laplace.gaussian_log_constant])
@@ -161,3 +150,245 @@ def test_the_likelihood_by_its_parts_is_that_of_the_definition(staves, spacing, 
     assert out[300] == expected[300] == -np.inf
     fine = np.arange(len(u)) != 300
     assert np.allclose(out[fine], expected[fine], rtol=3e-7, atol=1e-6)
+
+
+TILT = math.radians(30.0)
+
+
+@pytest.mark.parametrize('tilt', [-0.4, 0.0, 0.3, TILT, 1.2])
+def test_the_direction_sine_is_the_sine_of_the_angle(tilt):
+    rng = np.random.default_rng(0)
+    r = rng.uniform(5.0, 80.0, 1000)
+    D = r * rng.uniform(-1.0, 1.0, 1000)
+    angle = np.arcsin(D / r) - tilt
+    assert np.allclose(array.direction_sine(D, r, tilt), np.sin(angle), atol=1e-14)
+    assert np.allclose(array.angle_of_depth(D, r, tilt), angle, atol=1e-14)
+    assert np.allclose(array.depth_of_angle(angle, r, tilt), D, atol=1e-12)
+    assert np.allclose(np.hypot(array.across_track(D, r), D), r)
+
+
+def test_the_phase_is_that_of_the_path_to_each_stave():
+    D, r, wavelength = 15.0, 4e4, 0.01  # so far away that the wave is plane
+    echo = np.array([math.sqrt(r**2 - D**2), D])  # outward, down
+    staves = np.arange(8)[:, None] * 0.5 * wavelength * [-math.sin(TILT), math.cos(TILT)]
+    path = np.linalg.norm(echo - staves, axis=1)
+    a = array.steering(array.direction_sine(D, r, TILT), 8, 0.5)
+    assert np.allclose(a, np.exp(2j * np.pi * (r - path) / wavelength), atol=1e-6)
+    # The axis is orthogonal to where the array looks.
+    assert staves[1] @ [math.cos(TILT), math.sin(TILT)] == pytest.approx(0.0, abs=1e-18)
+
+
+def test_a_floor_beyond_the_range_is_impossible():
+    D = np.array([15.0 + 1e-9, -15.1, 15.0, np.nan, np.inf])
+    for values in (
+        array.direction_sine(D, 15.0, TILT),
+        array.angle_of_depth(D, 15.0, TILT),
+        array.across_track(D, 15.0),
+    ):
+        assert np.isnan(values).tolist() == [True, True, False, True, True]
+    assert np.isnan(array.direction_sine(1.0, 0.0, TILT))
+
+
+def test_conjugation_turns_the_phase_round():
+    u = np.linspace(-0.9, 0.9, 7)
+    straight, turned = (array.steering(u, 5, 0.4, conjugate=c) for c in (False, True))
+    assert straight.shape == (7, 5)
+    assert np.allclose(turned, straight.conj()) and np.allclose(turned, straight[::-1])
+    assert array.phase_step(0.4) == -array.phase_step(0.4, conjugate=True) == 0.8 * math.pi
+
+
+def test_the_mirror_of_the_surface():
+    D, r, surface = np.array([15.0, 15.0]), np.array([40.0, 20.0]), 3.0
+    sines = array.multipath_sines(D, r, TILT, surface)
+    assert sines.shape == (2, 2)
+    assert np.allclose(sines[:, 0], np.sin(np.arcsin(-surface / r) - TILT))
+    # The floor appears in the mirror as far above the surface as it lies below.
+    assert sines[0, 1] == pytest.approx(math.sin(math.asin(-(3.0 + 18.0) / 40.0) - TILT))
+    assert np.isnan(sines[1, 1])
+
+
+def test_the_grid_covers_all_that_can_be_told_apart():
+    assert array.largest_sine(0.25) == 1.0 and array.largest_sine(2.0) == 0.25
+    for staves, spacing in ((2, 0.5), (8, 0.5), (64, 0.5), (8, 0.2), (2, 3.66)):
+        grid = array.direction_grid(staves, spacing)
+        assert grid[-1] == -grid[0] == array.largest_sine(spacing)
+        assert np.diff(grid).max() <= 1.0 / (8 * staves * spacing) + 1e-12
+
+
+# -- beside interferers ---------------------------------------------------------------------------
+
+STAVES, SPACING = 8, 0.5
+SINES = np.array([[0.3, -0.2], [0.1, np.nan], [0.5, 0.55]])
+VARIANCES = np.array([[5.0, 2.0], [3.0, 3.0], [0.0, 4.0]])
+NOISE = np.array([1.0, 0.5, 2.0])
+
+
+@pytest.fixture
+def scene():
+    rng = np.random.default_rng(0)
+    y = rng.normal(size=(3, STAVES)) + 1j * rng.normal(size=(3, STAVES))
+    return y, interference.noise_covariance(SINES, VARIANCES, NOISE, STAVES, STEP)
+
+
+def test_the_covariance_is_the_sum_of_its_parts(scene):
+    y, covariance = scene
+    a, b = (array.steering(u, STAVES, SPACING) for u in (0.3, -0.2))
+    first = 5.0 * np.outer(a, a.conj()) + 2.0 * np.outer(b, b.conj()) + np.eye(STAVES)
+    assert np.allclose(covariance[0], first)
+    a, b = (array.steering(u, STAVES, SPACING) for u in (0.1, 0.55))
+    assert np.allclose(covariance[1], 3.0 * np.outer(a, a.conj()) + 0.5 * np.eye(STAVES))
+    assert np.allclose(covariance[2], 4.0 * np.outer(b, b.conj()) + 2.0 * np.eye(STAVES))
+    form = interference.interference_form(y, covariance)
+    assert np.allclose(form.log_determinant, np.linalg.slogdet(covariance)[1])
+
+
+@pytest.mark.parametrize('likelihood', laplace.LIKELIHOODS)
+def test_the_likelihood_by_its_parts_is_that_of_linear_algebra(scene, likelihood):
+    y, covariance = scene
+    form = interference.interference_form(y, covariance)
+    u, signal = np.append(np.linspace(-1.0, 1.0, 41), np.nan), 7.0
+    for n in range(3):
+        out = log_likelihoods(
+            u, SPACING, -signal * form.beam[n], form.base[n], form.spread[n], signal,
+            laplace.likelihood_table(STAVES, likelihood),
+        )  # fmt: skip
+        expected = interfered_log_likelihood(u, y[n], signal, covariance[n], STEP, likelihood)
+        assert out[-1] == expected[-1] == -np.inf
+        assert np.allclose(out[:-1], expected[:-1], rtol=3e-7, atol=1e-6)
+
+
+def noise(rng, *shape):
+    return rng.normal(size=shape) + 1j * rng.normal(size=shape)
+
+
+def test_it_is_the_maximum_over_all_directions():
+    iq = noise(np.random.default_rng(0), 400, 8)
+    gamma, sine = coherence.coherence(iq, 0.5)
+    grid = np.linspace(-1.0, 1.0, 4001)
+    beams = np.abs(iq @ array.steering(grid, 8, 0.5).conj().T) ** 2
+    exact = beams.max(axis=1) / (8.0 * np.square(np.abs(iq)).sum(axis=1))
+    assert np.abs(gamma - exact).max() < 0.01
+    inside = np.abs(grid[beams.argmax(axis=1)]) < 0.95
+    assert np.median(np.abs(sine - grid[beams.argmax(axis=1)])[inside]) < 1e-3
+
+
+def test_a_plane_wave_is_fully_coherent_whatever_its_level():
+    u = np.linspace(-0.95, 0.95, 101)
+    iq = np.geomspace(1e-9, 1e9, 101)[:, None] * array.steering(u, 8, 0.5)
+    gamma, sine = coherence.coherence(iq.astype(np.complex64), 0.5)
+    assert gamma.min() > 0.999 and gamma.max() <= 1.0
+    assert np.abs(sine - u).max() < 2e-3
+    turned = coherence.coherence(iq, 0.5, conjugate=True)[1]
+    assert np.abs(turned + u).max() < 2e-3
+
+
+def test_silent_and_broken_bins_have_none():
+    iq = noise(np.random.default_rng(1), 4, 8)
+    iq[0], iq[1, 3], iq[2, 0] = 0.0, np.nan, np.inf
+    gamma, sine = coherence.coherence(iq, 0.5)
+    assert np.isnan(gamma).tolist() == np.isnan(sine).tolist() == [True, True, True, False]
+    assert coherence.silent_bins(gamma, 8)[:3].all()
+
+
+@pytest.mark.parametrize('staves, spacing', [(2, 0.5), (3, 0.5), (8, 0.5), (8, 0.3), (24, 0.5)])
+def test_noise_passes_as_often_as_the_formula_says(staves, spacing):
+    gamma, _ = coherence.coherence(noise(np.random.default_rng(2), 60_000, staves), spacing)
+    for probability in (0.05, 0.01):
+        level = coherence.coherence_threshold(staves, 1, probability, spacing)
+        assert coherence.false_alarm_probability(level, staves, spacing) == pytest.approx(
+            probability
+        )
+        assert (gamma > level).mean() == pytest.approx(probability, rel=0.15, abs=2e-3)
+
+
+@pytest.mark.parametrize('staves', [2, 4, 8, 32])
+def test_means_of_bins_pass_at_most_as_often(staves):
+    gamma, _ = coherence.coherence(noise(np.random.default_rng(3), 100_000, staves), 0.5)
+    means = gamma.reshape(-1, coherence.GATE_BINS).mean(axis=1)
+    level = coherence.coherence_threshold(staves, coherence.GATE_BINS, 0.01)
+    assert 0.003 < (means > level).mean() < 0.013
+
+
+def test_thresholds_for_eight_staves():
+    assert coherence.coherence_threshold(8) == pytest.approx(0.782, abs=0.002)
+    assert coherence.coherence_threshold(8, coherence.GATE_BINS) == pytest.approx(0.563, abs=0.002)
+
+
+def test_the_law_for_two_staves_is_exact():
+    # gamma = 1/2 + |x0 x1| with |x0|^2 uniform: Pr(gamma > t) = 2 sqrt(t (1 - t)).
+    t = np.linspace(0.51, 1.0, 50)
+    expected = 2.0 * np.sqrt(t * (1.0 - t))
+    assert np.allclose(coherence.false_alarm_probability(t, 2), expected)
+
+
+def test_a_shadow_is_silent_and_an_echo_is_not():
+    rng = np.random.default_rng(4)
+    signal = np.where((np.arange(2000) // 200) % 2 == 0, 10.0, 0.0)  # 10 dB, shadows between
+    fading = rng.exponential(size=2000)
+    iq = noise(rng, 2000, 8) / np.sqrt(2.0)
+    iq += np.sqrt(signal / 2)[:, None] * noise(rng, 2000, 1) * array.steering(0.3, 8, 0.5)
+    silent = coherence.silent_bins(coherence.coherence(np.sqrt(fading)[:, None] * iq, 0.5)[0], 8)
+    assert silent[signal == 0.0].mean() > 0.99
+    # A coherent echo fades below the noise now and then.
+    assert silent[signal > 0.0].mean() < 0.3
+
+
+def test_for_two_staves_the_mean_decides():
+    iq = noise(np.random.default_rng(5), 3000, 2)
+    silent = coherence.silent_bins(coherence.coherence(iq, 0.5)[0], 2)
+    assert silent.mean() > 0.99
+    iq += 20.0 * noise(np.random.default_rng(6), 3000, 1) * array.steering(0.3, 2, 0.5)
+    silent = coherence.silent_bins(coherence.coherence(iq, 0.5)[0], 2)
+    assert silent.mean() < 0.3
+
+
+def test_the_compiled_peaks_are_those_of_numpy():
+    iq = noise(np.random.default_rng(7), 300, 8)
+    gamma, sine = coherence.coherence(iq, 0.5)
+    form = laplace.autocorrelation(iq)
+    form[:, 1:] *= 2.0
+    grid = array.direction_grid(8, 0.5)
+    cosine, sines = np.cos(np.pi * grid), np.sin(np.pi * grid)
+    height, place = np.empty(300), np.empty(300)
+    wave_kernels.beam_peaks(
+        form, cosine, sines, np.empty(len(grid)), np.empty(len(grid)), height, place
+    )
+    power = np.square(np.abs(iq)).sum(axis=1)
+    assert np.allclose(height / (8.0 * power), gamma, atol=1e-12)
+    assert np.allclose(grid[0] + place * (grid[1] - grid[0]), sine, atol=1e-9)
+
+
+def test_coherence_beside_an_interferer_is_that_of_what_it_leaves():
+    rng = np.random.default_rng(8)
+    iq = noise(rng, 4000, 8) + 30.0 * noise(rng, 4000, 1) * array.steering(-0.6, 8, 0.5)
+    assert not coherence.silent_bins(coherence.coherence(iq, 0.5)[0], 8)[10:].all()
+    step = array.phase_step(0.5)
+
+    def silent(samples):
+        R = interference.noise_covariance(
+            np.full((4000, 1), -0.6), 1800.0, np.full(4000, 2.0), 8, step
+        )
+        form = interference.interference_form(samples, R)
+        return coherence.silent_bins(interference.coherence_beside(form, 0.5), 8)
+
+    assert silent(iq).mean() > 0.98
+    iq += 20.0 * noise(rng, 4000, 1) * array.steering(0.2, 8, 0.5)
+    assert silent(iq).mean() < 0.1
+    assert np.isnan(
+        interference.coherence_beside(
+            interference.interference_form(np.zeros((1, 8)), np.eye(8)[None]), 0.5
+        )
+    ).all()
+
+
+def test_a_peak_is_refined_where_the_spectrum_bends_down_and_nowhere_else():
+    grid = np.linspace(-1.0, 1.0, 17)  # its steps are exact in binary
+    at = np.array([-0.31, 0.0, 0.27])
+    peak, place = coherence.refined_peak(0.9 - (grid - at[:, None]) ** 2, grid)
+    np.testing.assert_allclose(peak, 0.9, rtol=1e-12)
+    np.testing.assert_allclose(place, at, atol=1e-12)
+    slope, level, hollow = 0.5 + 0.25 * grid, np.full(17, 0.5), 0.1 + grid**2
+    peak, place = coherence.refined_peak(np.array([slope, level, hollow]), grid)
+    inside = [grid[-2], grid[1], grid[1]]
+    np.testing.assert_array_equal(place, inside)
+    np.testing.assert_allclose(peak, [slope[-2], 0.5, hollow[1]])

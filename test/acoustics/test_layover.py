@@ -6,10 +6,12 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Two surfaces in a range bin: the residuals, what they say, and how often they are right."""
+"""Two surfaces in a range bin: the residuals, what they say, and how often they are right; spectra
+of directions, also of a real instrument."""
 
 from itertools import product
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +19,9 @@ import pytest
 from scipy.optimize import minimize
 
 from benchmarks.layover_tables import levels, pooled, snapshots
-from sonar_imm.acoustics import layover
+from sonar_imm.acoustics import array, coherence, layover, loudness, spatial, variances
 from sonar_imm.acoustics.variances import mean_power, signal_variance
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'layover'
 
@@ -219,3 +222,190 @@ def test_of_staves_close_to_each_other_only_directions_that_are_there_are_fitted
     phase = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 4001)
     beams = np.abs(iq @ np.exp(-1j * np.outer(np.arange(8), phase))) ** 2 / 8.0
     np.testing.assert_allclose(single, power - beams.max(axis=1), rtol=1e-4)
+
+
+TILT, HEIGHT = math.radians(30.0), 15.0
+GRID = np.linspace(-0.9, 0.9, 361)
+
+
+@pytest.fixture(scope='module')
+def paper_pings():
+    scene = simulate(scenario('paper', {'pings': 24}), 11)
+    return [(entry.measurement, true) for entry, true in zip(scene.measurements, scene.truth)]
+
+
+def plane_waves(u, staves=8, spacing=0.5, noise=0.01, conjugate=False, seed=0):
+    rng = np.random.default_rng(seed)
+    phase = np.exp(2j * np.pi * rng.uniform(size=(len(u), 1)))
+    y = phase * array.steering(u, staves, spacing, conjugate=conjugate)
+    return y + noise * (rng.normal(size=y.shape) + 1j * rng.normal(size=y.shape))
+
+
+@pytest.mark.parametrize('conjugate', [False, True])
+@pytest.mark.parametrize('method', sorted(spatial.SPECTRA))
+def test_a_lone_wave_is_found(method, conjugate):
+    for u in (-0.71, 0.003, 0.42):
+        iq = plane_waves(np.full(30, u), conjugate=conjugate)
+        spectrum = spatial.ping_spectrum(iq, GRID, 0.5, method=method, conjugate=conjugate)
+        assert spectrum.shape == (30, len(GRID))
+        assert np.abs(spatial.peak_sines(spectrum, GRID) - u).max() < 2e-3
+
+
+def test_two_waves_closer_than_a_beam_are_told_apart():
+    rng = np.random.default_rng(1)
+    waves = [array.steering(u, 8, 0.5) for u in (0.1, 0.25)]
+    s = rng.normal(size=(200, 2)) + 1j * rng.normal(size=(200, 2))
+    iq = s @ np.array(waves) + 0.05 * (rng.normal(size=(200, 8)) + 1j * rng.normal(size=(200, 8)))
+    covariance = spatial.sample_covariance(iq, 200)[:1]
+    vectors = array.steering(GRID, 8, 0.5)
+    for spectrum, peaks in (
+        (spatial.music_spectrum(covariance, vectors, sources=2)[0], 2),
+        (spatial.capon_spectrum(covariance, vectors)[0], 2),
+        (spatial.bartlett_spectrum(covariance, vectors)[0], 1),
+    ):
+        top = (spectrum[1:-1] > spectrum[:-2]) & (spectrum[1:-1] > spectrum[2:])
+        found = GRID[1:-1][top & (spectrum[1:-1] > 0.3 * spectrum.max())]
+        assert len(found) == peaks
+        if peaks == 2:
+            assert found == pytest.approx([0.1, 0.25], abs=0.01)
+
+
+def test_spectra_are_what_their_definitions_say():
+    iq = plane_waves(np.linspace(-0.5, 0.5, 12), staves=5, noise=0.5)
+    covariance = spatial.sample_covariance(iq, 4)
+    assert np.allclose(covariance[0], sum(np.outer(y, y.conj()) for y in iq[:5]) / 5)
+    a = array.steering(0.3, 5, 0.5)
+    R = covariance[6]
+    loaded = R + spatial.LOADING * np.trace(R).real / 5 * np.eye(5)
+    noise = np.linalg.eigh(R)[1][:, :-1]
+    expected = {
+        'bartlett': (a.conj() @ R @ a).real / (5 * np.trace(R).real),
+        'capon': 1.0 / (a.conj() @ np.linalg.solve(loaded, a)).real,
+        'music': 1.0 / np.linalg.norm(noise.conj().T @ a) ** 2,
+    }
+    for name, value in expected.items():
+        assert spatial.SPECTRA[name](covariance, a[None])[6, 0] == pytest.approx(value)
+    with pytest.raises(ValueError, match='not 5'):
+        spatial.music_spectrum(covariance, a[None], sources=5)
+
+
+def test_phase_difference_of_any_pair():
+    u = np.linspace(-0.4, 0.4, 25)
+    for pair, spacing, conjugate in (((0, 1), 0.5, False), ((3, 5), 0.3, True)):
+        iq = plane_waves(u, spacing=spacing, noise=1e-6, conjugate=conjugate)
+        sines = spatial.phase_difference_sines(
+            iq, spacing, pair=pair, half_width=0, conjugate=conjugate
+        )
+        assert np.allclose(sines, u, atol=1e-4)
+
+
+def test_spoilt_bins_are_left_out():
+    iq = plane_waves(np.full(40, 0.2))
+    iq[10:15, 2], iq[30] = np.nan, 0.0
+    sines = spatial.phase_difference_sines(iq, 0.5, half_width=3)
+    assert np.isfinite(sines).all() and np.abs(sines - 0.2).max() < 0.02
+    for method in spatial.SPECTRA:
+        spectrum = spatial.ping_spectrum(iq, GRID, 0.5, method=method, half_width=3)
+        assert np.abs(spatial.peak_sines(spectrum, GRID) - 0.2).max() < 0.01
+    iq[:] = np.nan
+    assert np.isnan(spatial.phase_difference_sines(iq, 0.5)).all()
+    assert spatial.ping_spectrum(iq, GRID, 0.5, method='capon').shape == (40, 361)
+
+
+# What is attainable on the scene of the paper: RMSE of the height on smooth floor, in the patch,
+# and over all, in metres, and of the angle in degrees. From an independent prototype.
+ATTAINABLE = {
+    'phase': (1.71, 0.98, 1.61, 1.51),
+    'capon': (0.258, 0.529, 0.320, 0.37),
+    'music': (0.186, 0.527, 0.274, 0.34),
+}
+
+
+@pytest.mark.parametrize('method', sorted(ATTAINABLE))
+def test_errors_are_what_is_attainable(paper_pings, method):
+    squares = []
+    for ping, true in paper_pings:
+        if method == 'phase':
+            sine = spatial.phase_difference_sines(ping.iq, 0.5)
+        else:
+            sine = spatial.peak_sines(
+                spatial.ping_spectrum(ping.iq, GRID, 0.5, method=method), GRID
+            )
+        angle = np.arcsin(np.clip(sine, -1.0, 1.0))
+        height = HEIGHT - array.depth_of_angle(angle, ping.range, TILT)
+        error = np.square(height - true.height)
+        turn = np.square(np.degrees(angle - true.angle))
+        squares.append(
+            [error[~true.patch].mean(), error[true.patch].mean(), error.mean(), turn.mean()]
+        )
+    rms = np.sqrt(np.mean(squares, axis=0))
+    assert rms == pytest.approx(ATTAINABLE[method], rel=0.06)
+
+
+# -- one ping of a split-beam echo sounder as an array of two staves: phase, geometry and coherence
+# gate work on samples of a real instrument. The calibration sphere is at its range and angle, the
+# floor straight below. A beam of 7 degrees with halves 3.7 wavelengths apart is no swath ----------
+
+ROOT = Path(__file__).resolve().parents[2]
+PING = Path(os.environ.get('SONAR_IMM_DATA', ROOT / '../shared/data')) / 'crimac_ek80/ping.npz'
+
+recorded = pytest.mark.skipif(
+    not PING.exists(),
+    reason='the recording crimac_ek80 is not here: set SONAR_IMM_DATA to the folder that holds it',
+)
+
+
+@pytest.fixture(scope='module')
+def split_beam():
+    """Range (n,), samples of the port and starboard halves (n, 2), spacing in wavelengths."""
+    with np.load(PING) as archive:
+        quadrants = archive['quadrants']
+        iq = np.stack([quadrants[:, [1, 2]].sum(axis=1), quadrants[:, [0, 3]].sum(axis=1)], axis=1)
+        return archive['range_m'].astype(float), iq, float(archive['spacing_wavelengths'])
+
+
+def strongest(ranges, iq, first, last):
+    power = np.where((ranges > first) & (ranges < last), variances.mean_power(iq), 0.0)
+    return int(power.argmax())
+
+
+@recorded
+def test_the_sphere_is_where_it_was_measured(split_beam):
+    ranges, iq, spacing = split_beam
+    sphere = strongest(ranges, iq, 4.0, 8.0)
+    assert ranges[sphere] == pytest.approx(5.79, abs=0.02)
+    gamma, sine = coherence.coherence(iq[sphere : sphere + 1], spacing)
+    assert gamma[0] > 0.999
+    for half_width in (0, 2, 5):
+        phase = spatial.phase_difference_sines(iq, spacing, half_width=half_width)[sphere]
+        assert np.degrees(np.arcsin(phase)) == pytest.approx(2.2, abs=0.15)
+    # Both ways of looking at the same phase agree.
+    assert sine[0] == pytest.approx(
+        spatial.phase_difference_sines(iq, spacing, half_width=0)[sphere], abs=1e-4
+    )
+
+
+@recorded
+def test_the_floor_lies_straight_below(split_beam):
+    ranges, iq, spacing = split_beam
+    floor = strongest(ranges, iq, 10.0, 13.9)
+    assert 12.0 < ranges[floor] < 13.0
+    phase = spatial.phase_difference_sines(iq, spacing)[floor]
+    assert abs(np.degrees(np.arcsin(phase))) < 1.5
+
+
+@recorded
+def test_power_hears_the_floor_that_coherence_takes_for_noise(split_beam):
+    ranges, iq, spacing = split_beam
+    silent = coherence.silent_bins(coherence.coherence(iq, spacing)[0], 2, spacing=spacing)
+    power, water = variances.mean_power(iq), (ranges > 7.0) & (ranges < 10.0)
+    ratio = power / power[water].mean()
+    level = loudness.loud_level(2, coherence.GATE_BINS, 1e-3)
+    usable = np.ones(len(ranges), bool)
+    loud = loudness.loud_bins(ratio, level, bins=coherence.GATE_BINS, usable=usable)
+    floor = (ratio > loudness.VERY_LOUD) & (ranges > 12.0)
+    assert floor.sum() > 150 and silent[floor].mean() > 0.85  # 20 to 78 dB above the noise
+    assert loud[floor].mean() > 0.98
+    assert silent[water].all() and loud[water].mean() < 0.005
+    # A diffuse floor: a quarter of its power differs between the halves.
+    assert 0.1 < variances.decorrelation(iq, floor) < 0.35

@@ -6,10 +6,21 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
+"""Powers of echoes and noise, and the staves of an array from its echoes: against vectors made
+independently, the scene of the paper, and errors that are put in."""
+
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.stats import gamma
 
-from sonar_imm.acoustics import variances
+from sonar_imm.acoustics import array, loudness, variances
+from sonar_imm.acoustics.calibration import calibrate, Calibration
+from sonar_imm.acoustics.coherence import coherence
+from sonar_imm.acoustics.laplace import form_coefficients
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, snr
 
 
@@ -141,3 +152,288 @@ def test_a_bin_is_compared_with_the_five_on_either_side_of_it(apart, differ):
     iq[10] = np.exp(2.0j * np.arange(4))
     found = variances.decorrelation(iq, chosen)
     assert found > 0.1 if differ else found == pytest.approx(0.0, abs=1e-9)
+
+
+def noise_power(rng, bins, staves, *, fading=True):
+    """Mean power of noise bins (bins,) in noise powers."""
+    power = rng.gamma(staves, size=bins) / staves
+    return power * rng.exponential(size=bins) if fading else power
+
+
+@pytest.mark.parametrize('staves', [1, 2, 3, 8, 64])
+def test_the_law_of_fading_noise_is_that_of_its_integral(staves):
+    for level in (0.01, 0.5, 2.0, 9.0):
+        exact, _ = quad(
+            lambda z, level=level: np.exp(-z) * gamma.sf(staves * level / z, staves), 0.0, np.inf
+        )
+        assert loudness.noise_exceeds(level, staves) == pytest.approx(exact, rel=1e-6, abs=1e-12)
+    assert loudness.noise_exceeds(0.0, staves) == 1.0
+    assert 0.0 <= loudness.noise_exceeds(1e9, staves) < 1e-300
+
+
+@pytest.mark.parametrize('staves', [2, 3, 8])
+def test_levels_let_pass_as_much_noise_as_asked(staves):
+    rng = np.random.default_rng(1)
+    power = noise_power(rng, 500_000, staves).reshape(-1, 5)
+    for false_alarm in (0.05, 0.01):
+        level = loudness.loud_level(staves, 5, false_alarm)
+        assert (power.mean(axis=1) > level).mean() == pytest.approx(false_alarm, rel=0.12)
+    level = loudness.loud_level(staves, 1, 0.01)
+    assert loudness.noise_exceeds(level, staves) == pytest.approx(0.01, rel=0.01)
+    steady = noise_power(rng, 100_000, staves, fading=False).reshape(-1, 5).mean(axis=1)
+    assert (steady > loudness.loud_level(staves, 5, 0.01)).mean() < 1e-3
+
+
+def test_a_burst_is_none_of_the_floor_and_an_edge_is_no_burst():
+    rng = np.random.default_rng(2)
+    power = noise_power(rng, 400, 2)
+    power[200:] *= 1e4  # the floor begins
+    found = loudness.bursts(power)
+    assert found[190:210].sum() <= 1
+    power[[60, 61, 300]] = [1e3, 1e3, 1e7]
+    assert loudness.bursts(power)[[60, 61, 300]].all()
+    usable = np.ones(400, bool)
+    loud = loudness.loud_bins(power, 5.0, bins=5, usable=usable)
+    assert loud[210:].mean() > 0.95 and not loud[[60, 61, 300]].any()
+    usable[350] = False
+    assert not loudness.loud_bins(power, 5.0, bins=5, usable=usable)[350]
+
+
+def test_a_burst_is_one_beside_the_twenty_bins_before_it_and_after_it():
+    power = np.full(200, 1e4)
+    power[80:121], power[100] = 1.0, 1e3
+    assert np.flatnonzero(loudness.bursts(power)).tolist() == [100]
+    power[86:97] = 1e4  # most of those before it
+    assert not loudness.bursts(power).any()
+    for first, alone in ((80, False), (81, True)):  # ten of those before it, nine
+        power = np.ones(200)
+        power[first:90], power[100] = 1e4, 1e3
+        assert loudness.bursts(power)[100] == alone
+
+
+def test_a_loud_stretch_that_is_not_coherent_is_a_diffuse_floor_and_a_spike_is_not():
+    rng = np.random.default_rng(3)
+    ratio, usable = 1e4 * noise_power(rng, 600, 8), np.ones(600, bool)
+    ratio[:200] = noise_power(rng, 200, 8)
+    silent = np.zeros(600, bool)
+    silent[:200] = True  # a shadow
+    silent[200:400] = rng.random(200) < 0.8  # a diffuse floor
+    silent[400:] = rng.random(200) < 0.1  # spikes on a coherent one
+    found = loudness.diffuse_bins(ratio, silent, usable)
+    assert not found[:200].any() and found[215:385].mean() > 0.9 and not found[415:].any()
+
+
+def test_noise_is_never_very_loud_20_db_are():
+    incoherent, usable = np.ones(200, bool), np.ones(200, bool)
+    assert not loudness.diffuse_bins(np.full(200, 90.0), incoherent, usable).any()
+    assert loudness.diffuse_bins(np.full(200, 110.0), incoherent, usable).all()
+
+
+def diffuse(rng, bins, staves, share, *, snr=1e4):
+    def circular(*shape):
+        return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2.0)
+
+    wave = np.sqrt(1.0 - share) * circular(bins, 1) * np.exp(0.7j * np.arange(staves))
+    wave = wave + np.sqrt(share) * circular(bins, staves)
+    fading = np.sqrt(rng.exponential(size=(bins, 1)))
+    return fading * (np.sqrt(snr) * wave + circular(bins, staves))
+
+
+@pytest.mark.parametrize('staves', [2, 8])
+def test_the_share_that_differs_from_stave_to_stave_is_measured(staves):
+    rng = np.random.default_rng(4)
+    for share in (0.0, 0.1, 0.3):
+        iq = diffuse(rng, 2000, staves, share)
+        found = variances.decorrelation(iq, np.ones(2000, bool))
+        # Two staves agree by chance in windows of eleven bins: they show too little.
+        assert share * (0.5 if staves == 2 else 0.85) - 0.01 < found < share + 0.02
+    iq[5], iq[7] = np.nan, 0.0
+    chosen = np.isfinite(iq).all(axis=1) & (np.arange(2000) != 7)
+    assert np.isfinite(variances.decorrelation(iq, chosen))
+    assert np.isnan(variances.decorrelation(iq, np.zeros(2000, bool)))
+
+
+VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry_by_default' / 'array.npz'
+EVERY = np.ones(1200, bool)
+
+
+def circular(rng, *shape):
+    return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) * math.sqrt(0.5)
+
+
+def echoes(staves=8, *, seed=1, bins=1200, spacing=0.5, decibels=(30.0, 10.0), noise=1.0):
+    """Plane waves from directions that wander, and noise of 1, or of `noise` (P,)."""
+    rng = np.random.default_rng(seed)
+    sine = 0.6 * np.sin(np.linspace(0.0, 4.0, bins)) + 0.05 * rng.normal(size=bins)
+    level = 10.0 ** (np.linspace(*decibels, bins) / 20.0)[:, None]
+    y = level * circular(rng, bins, 1) * array.steering(sine, staves, spacing)
+    y += np.sqrt(noise) * circular(rng, bins, staves)
+    return y * np.sqrt(rng.exponential(size=(bins, 1)))
+
+
+def measured(iq, spacing=0.5, noise=1.0):
+    known = None if noise is None else np.full(len(iq), noise)
+    return calibrate(iq, np.ones(len(iq), bool), spacing, known)
+
+
+def without_line(phase, live):
+    place = np.arange(len(phase))
+    return phase - np.polyval(np.polyfit(place[live], phase[live], 1), place)
+
+
+def test_gain_phase_and_what_is_live_are_those_of_the_vectors():
+    with np.load(VECTORS) as case:
+        live, phase = case['live'], case['phase']
+        true = case['gain_true'] / np.median(case['gain_true'][live])
+        iq = case['iq'][..., 0].astype(float) + 1j * case['iq'][..., 1].astype(float)
+        found = [measured(ping) for ping in iq]
+        for each in found:
+            assert (each.live == live).all() and each.bins > 700
+            assert np.degrees(np.abs(each.phase - phase)[live]).max() < 0.6
+            assert each.gain[live] == pytest.approx(true[live], rel=0.025)
+            assert each.coherence[live].min() > 0.97 and each.coherence[~live].max() < 0.35
+            # The vectors have the root mean square, here it is that of phases beside a line.
+            tilt = float(case['phase_tilt']) * math.sqrt(7.0 / 3.0)
+            assert each.sine_std == pytest.approx(tilt, rel=0.03)
+        # To the reach of the vectors, of three pings.
+        assert np.mean([c.gain[live] for c in found], axis=0) == pytest.approx(
+            true[live], rel=0.01
+        )
+        off = np.mean([c.phase for c in found], axis=0) - phase
+        assert np.degrees(np.abs(off[live])).max() < 0.3
+
+
+@pytest.mark.parametrize('staves, spacing', [(4, 0.5), (8, 2.0), (8, 0.2), (17, 0.5)])
+@pytest.mark.parametrize('noise', [1.0, None])
+def test_an_exact_array_stays_as_it_is_to_the_bit(staves, spacing, noise):
+    for seed in range(4):
+        iq = echoes(staves, seed=seed, spacing=spacing)
+        found = measured(iq, spacing, noise)
+        assert found.is_exact and found.apply(iq) is iq and found.weights is None
+        assert found.level == found.mean_noise == 1.0 and found.sine_std == found.log_volume == 0.0
+        assert not found.no_wave.any() and found.bins > 0
+
+
+def test_gains_and_phases_are_measured_and_taken_off():
+    rng = np.random.default_rng(3)
+    gain, phase = np.exp(0.3 * rng.normal(size=8)), 0.3 * rng.normal(size=8)
+    gain /= np.median(gain)
+    iq = echoes()
+    found = measured(iq * gain * np.exp(1j * phase))
+    assert found.live.all() and found.gain == pytest.approx(gain, rel=0.02)
+    rest = without_line(found.phase - phase, found.live)
+    assert np.abs(rest).max() < math.radians(0.7)
+    turned = np.median(np.abs(found.apply(iq * gain * np.exp(1j * phase))) / np.abs(iq), axis=0)
+    assert turned == pytest.approx(1.0, rel=0.02)
+    wide = 2.0 * math.pi * 0.5 * math.sqrt(42.0)
+    assert found.sine_std == pytest.approx(math.sqrt(np.sum(found.phase**2) / 4.0) / wide)
+
+
+def test_a_phase_that_grows_evenly_is_a_tilt_and_stays():
+    iq = echoes() * np.exp(0.1j * np.arange(8))
+    assert measured(iq).is_exact
+
+
+@pytest.mark.parametrize('stave', [0, 3, 7])
+def test_dead_deaf_and_inverted_staves_are_found(stave):
+    iq, others = echoes(), np.arange(8) != stave
+    dead, deaf, inverted = iq.copy(), iq.copy(), iq.copy()
+    dead[:, stave] = 0.0
+    deaf[:, stave] = 10.0 * circular(np.random.default_rng(5), len(iq))
+    inverted[:, stave] *= -1.0
+    for broken in (dead, deaf):
+        found = measured(broken)
+        assert (found.live == others).all() and (found.apply(broken)[:, stave] == 0.0).all()
+        assert found.count == 7 and found.weights.sum() == pytest.approx(7.0)
+        assert found.power(broken)[0] == pytest.approx(np.mean(np.abs(broken[0, others]) ** 2))
+    found = measured(inverted)
+    assert found.live.all() and abs(found.phase[stave]) > math.radians(179.0)
+    assert np.abs(found.phase[others]).max() < math.radians(1.0)
+    assert found.apply(inverted) == pytest.approx(iq, rel=0.1, abs=0.1)
+
+
+@pytest.mark.parametrize('pairs', [((2, 3),), ((1, 6),), ((0, 1), (5, 7))])
+def test_exchanged_staves_are_put_back(pairs):
+    order = np.arange(8)
+    for a, b in pairs:
+        order[[a, b]] = order[[b, a]]
+    iq = echoes()
+    found = measured(iq[:, order])
+    assert (found.order == order).all() and not found.no_wave.any()
+    assert (found.apply(iq[:, order]) == iq).all()
+
+
+def test_a_stave_at_another_place_is_named_and_not_exchanged():
+    iq = echoes()
+    rng = np.random.default_rng(2)
+    iq[:, 4] *= np.exp(0.9j * rng.normal(size=len(iq)))
+    found = measured(iq)
+    assert np.flatnonzero(found.no_wave).tolist() == [4]
+    assert (found.order == np.arange(8)).all() and found.live.all()
+
+
+def test_the_noise_of_each_stave_is_measured():
+    true = np.array([1.0, 1.0, 4.0, 1.0, 1.0, 1.0, 10.0, 1.0])
+    found = [measured(echoes(seed=seed, noise=true)) for seed in range(4)]
+    noise = np.exp(np.mean([np.log(each.noise) for each in found], axis=0))
+    assert noise == pytest.approx(true, rel=0.15)
+    quiet = np.flatnonzero(true == 1.0)
+    assert all(each.noise[quiet] == pytest.approx(1.0, rel=2e-3) for each in found)
+    one = found[0]
+    assert one.weights.sum() == pytest.approx(8.0)
+    assert one.level == pytest.approx(8.0 / np.sum(1.0 / one.noise))
+    assert one.log_volume == pytest.approx(-np.log(one.weights).sum())
+
+
+def test_gains_before_a_common_noise_leave_the_stated_noise_to_the_median_stave():
+    gain = np.array([1.0, 1.0, 0.4, 1.0, 1.0, 1.0, 1.0, 2.0])
+    noise = 1.0 / gain**2
+    found = measured(echoes(noise=noise, seed=4) * gain)
+    assert found.noise == pytest.approx(noise, rel=0.3) and found.gain == pytest.approx(gain, 0.03)
+    assert np.median(found.noise * found.gain**2) == pytest.approx(1.0, rel=2e-3)
+
+
+def test_what_shows_no_array_leaves_it_alone():
+    rng = np.random.default_rng(8)
+    noise = 10.0 * circular(rng, 1200, 8)
+    few = echoes()
+    few[45:] = 0.0
+    turn = np.exp(1.5j * np.arange(8))
+    many_ways = echoes() + turn * echoes(seed=2) + turn.conj() * echoes(seed=3)
+    for iq in (noise, few, many_ways, echoes(3)):
+        assert measured(iq).is_exact and measured(iq).weights is None
+    assert calibrate(noise, EVERY, 0.5, None).is_exact
+
+
+@pytest.mark.parametrize('dead', [(), (2,), (0, 5)])
+def test_the_form_with_weights_is_that_of_the_covariance(dead):
+    rng = np.random.default_rng(6)
+    staves, signal = 7, 3.7
+    live = ~np.isin(np.arange(staves), dead)
+    noise = np.where(live, rng.uniform(0.3, 4.0, staves), 1.0)
+    exact = Calibration.exact(staves)
+    one = Calibration(
+        live, exact.gain, exact.phase, exact.coherence, noise, exact.order, exact.no_wave
+    )
+    y = np.where(live, circular(rng, 5, staves), 0.0)
+    step = array.phase_step(0.5)
+    level = np.full(5, one.level)
+    g = form_coefficients(y, np.full(5, signal), level, one.weights)
+    for u in (-0.8, 0.1, 0.6):
+        a = np.exp(1j * step * u * np.arange(staves))[live]
+        gamma = signal * np.outer(a, a.conj()) + np.diag(noise[live])
+        q = np.einsum('tp,pq,tq->t', y[:, live].conj(), np.linalg.inv(gamma), y[:, live]).real
+        found = (g * np.exp(-1j * step * u * np.arange(staves))).sum(axis=1).real
+        assert found == pytest.approx(q, rel=1e-10)
+        size = one.count * math.log(one.level) + math.log1p(one.count * signal / one.level)
+        assert size + one.log_volume == pytest.approx(np.linalg.slogdet(gamma)[1])
+
+
+def test_coherence_with_weights_is_that_of_the_live_staves():
+    iq = echoes(bins=300)
+    gamma, sine = coherence(iq[:, :6], 0.5)
+    iq[:, 6:] = 0.0
+    weights = np.array([1.0] * 6 + [0.0] * 2)
+    other, there = coherence(iq, 0.5, weights=weights)
+    # The grid of eight staves is finer than that of six.
+    assert other == pytest.approx(gamma, abs=2e-3) and there == pytest.approx(sine, abs=0.02)

@@ -118,20 +118,6 @@ def test_world_headings_compose_in_position():
     np.testing.assert_allclose(P[..., :2, :2], long_P[..., :2, :2], atol=1e-12)
 
 
-def test_a_relative_heading_turns_what_is_there():
-    models = build_models(DiverConfig(model_set='bench_relative_headings', directions=4))
-    moved = models.motion(2.0).F @ [0.0, 0.0, 0.5, 0.0]
-    np.testing.assert_allclose(moved[0], [1.0, 0.0, 0.5, 0.0], atol=1e-12)
-    np.testing.assert_allclose(moved[1], [0.0, 1.0, 0.0, 0.5], atol=1e-12)
-
-
-def test_a_lateral_speed_has_the_variance_that_is_stated():
-    models = build_models(DiverConfig(model_set='bench_heading_speed_lateral'))
-    F, Q, _ = (part[3] for part in models.motion(7.0))
-    assert F[3, 3] ** 2 * 0.04 + Q[3, 3] == pytest.approx(0.04)
-    assert np.linalg.eigvalsh(Q).min() > -1e-12
-
-
 def test_sixteen_directions_beat_one():
     truth, z, R = diver_paper.load(['table1'], range(8))
     errors = {'fixes': diver_paper.rmse(z, truth)}

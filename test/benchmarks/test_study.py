@@ -11,16 +11,12 @@
 from collections.abc import Sequence
 from datetime import date
 import json
-import math
 import os
 
-from attrs import evolve
 from helpers.source import ROOT
 import pytest
 
 from benchmarks import study
-from sonar_imm_tools.cli import main
-from sonar_imm_tools.offline.tracking import InputOptions
 
 
 def numbers(runs: int = 3, cases: Sequence[str] = ('a', 'b'), fast: bool = False) -> study.Parts:
@@ -92,61 +88,3 @@ def test_a_file_says_how_it_was_made(tmp_path):
     assert list(content) == ['made', 'n']
     assert content['made']['command'].startswith('python ')
     assert content['made']['commit'] and content['made']['date'] <= date.today().isoformat()
-
-
-# -- many seeds of one scene ----------------------------------------------------------------------
-
-
-def test_a_seed_scores_as_simulate_track_and_evaluate_say(tmp_path, capsys):
-    scene = {'first_range': '30', 'last_range': '20', 'sonar_lever': '2,0,-0.3'}
-    plan = study.planned('obstacle', 'approach', scene)
-    bag, run = str(tmp_path / 'bag'), str(tmp_path / 'run')
-    words = [word for pair in scene.items() for word in ('--set', '='.join(pair))]
-    assert main(['simulate', 'obstacle', bag, '--seed', '7', *words]) == 0
-    assert main(['track', bag, run]) == 0
-    capsys.readouterr()
-    assert main(['evaluate', run, '--no-report', '--json']) == 0
-    wanted = study.finite_numbers(json.loads(capsys.readouterr().out))
-    assert plan.config.sonar_lever == (2.0, 0.0, -0.3)
-    assert study.run_seed(plan, 7).metrics == wanted and 'gospa.mean_m' in wanted
-
-
-def test_processes_give_the_same_record_as_one_process(monkeypatch):
-    for name in study.ONE_THREAD:
-        monkeypatch.setenv(name, '1')
-    plan = study.planned('diver', 'table1', {'duration': '15'})
-    one, two = (study.record(plan, study.run_seeds(plan, range(5, 8), n)) for n in (1, 2))
-    assert one == two and one['seeds'] == [5, 6, 7] and not one['failures']
-    assert one['scene']['duration'] == 15.0 and one['parameters']['model_set'] == 'families'
-    assert {'sonar_imm', 'numpy', 'numba'} <= one['versions'].keys()
-
-
-def test_a_run_that_fails_gives_the_same_sentence_each_time(monkeypatch):
-    from sonar_imm_tools.simulation import diver
-
-    def broken(config, seed):
-        raise ZeroDivisionError('division\nby zero')
-
-    plan = study.planned('diver', 'table1', {})
-    lost = evolve(plan, options=InputOptions(topics={'/nowhere': 'fix'}))
-    first, again = study.run_seeds(lost, [0, 0], 1)
-    assert first.failure == again.failure
-    assert first.failure.startswith("scene has no topic '/nowhere'")
-    monkeypatch.setattr(diver, 'simulate', broken)
-    assert study.run_seed(plan, 0).failure == 'ZeroDivisionError: division by zero'
-
-
-@pytest.mark.filterwarnings('error')  # one run has no spread, and says nothing on the terminal
-def test_the_sums_are_those_of_the_runs_that_gave_the_metric():
-    outcomes = [
-        study.Outcome(2, {'a': 4.0, 'b': 7}),
-        study.Outcome(0, {'a': 1.0}),
-        study.Outcome(3, failure='no'),
-        study.Outcome(1, {'a': 1.0}),
-    ]
-    summary = study.summarise(outcomes)
-    assert list(summary) == ['a', 'b']
-    assert summary['a'] == pytest.approx(
-        {'runs': 3, 'mean': 2.0, 'std': math.sqrt(3.0), 'stderr': 1.0, 'p05': 1.0, 'p95': 3.7}
-    )
-    assert summary['b']['runs'] == 1 and math.isnan(summary['b']['stderr'])

@@ -170,6 +170,15 @@ def test_a_package_that_is_not_there_is_named(monkeypatch, capsys):
     assert 'sonar_imm[ros]' in capsys.readouterr().err
 
 
+def test_a_name_that_a_library_cannot_take_is_told(monkeypatch, capsys):
+    def encoded(self):
+        'dive\udcff'.encode()
+
+    monkeypatch.setattr('sonar_imm_tools.recordings.reader.BagReader.__enter__', encoded)
+    assert main(['info', 'x.bag']) == 2
+    assert r'dive\udcff is not UTF-8' in capsys.readouterr().err
+
+
 def test_ctrl_c_is_clean(monkeypatch, capsys):
     def interrupted(self):
         raise KeyboardInterrupt

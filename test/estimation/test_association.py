@@ -6,8 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Gating and assignment against brute force, track life against the definition."""
+"""Gating, assignment, the life of tracks, measures of consistency and distance: against
+definitions, brute force, closed forms and Stone Soup."""
 
+import datetime
 import itertools
 
 from attrs import evolve
@@ -28,6 +30,19 @@ from sonar_imm.estimation.association import (
     TrackRules,
     Tracks,
     TrackStatus,
+)
+from sonar_imm.estimation.consistency import (
+    average_bounds,
+    gospa,
+    identity_switches,
+    interval_coverage,
+    nees,
+    nis,
+    NIS_MEMORY,
+    NisMemory,
+    ospa,
+    switches_by_scan,
+    switching_gospa,
 )
 
 RULES = TrackRules(confirm_hits=3, confirm_window=5, delete_misses=2, max_coast_ns=100)
@@ -82,18 +97,10 @@ def test_clusters_give_the_cost_of_one_big_assignment():
 def test_the_order_of_the_pairs_does_not_matter():
     rng = np.random.default_rng(4)
     cells = rng.choice(400, 120, replace=False)
-    t, d, cost = cells // 20, cells % 20, rng.integers(-3, 1, 120).astype(float)  # many ties
-    expected = assign(*sorted_pairs(t, d, cost), 20, 20)
-    shuffle = rng.permutation(120)
-    np.testing.assert_array_equal(
-        assign(*sorted_pairs(t[shuffle], d[shuffle], cost[shuffle]), 20, 20), expected
-    )
-    np.testing.assert_array_equal(assign(t[shuffle], d[shuffle], cost[shuffle], 20, 20), expected)
-
-
-def sorted_pairs(t, d, cost):
-    order = np.lexsort((d, t))
-    return t[order], d[order], cost[order]
+    pairs = cells // 20, cells % 20, rng.integers(-3, 1, 120).astype(float)  # many ties
+    expected = assign(*pairs, 20, 20)
+    for order in (rng.permutation(120), np.argsort(cells)):
+        np.testing.assert_array_equal(assign(*(each[order] for each in pairs), 20, 20), expected)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 8), st.integers(1, 8))
@@ -107,8 +114,8 @@ def test_ranks_choose_in_turn(seed, targets, detections):
     left = list(range(detections))
     for turn in (0, 1, 2):
         own = np.flatnonzero(rank == turn)
-        rows, columns = linear_sum_assignment(np.minimum(table[np.ix_(own, left)], 0.0))
-        best = np.minimum(table[np.ix_(own, left)], 0.0)[rows, columns].sum()
+        worth = np.minimum(table[np.ix_(own, left)], 0.0)
+        best = worth[linear_sum_assignment(worth)].sum()
         got = [(t, chosen[t]) for t in own if chosen[t] >= 0]
         assert {d for _, d in got} <= set(left)
         assert sum(table[t, d] for t, d in got) == pytest.approx(best)
@@ -151,8 +158,8 @@ def test_association_cost_is_the_log_of_the_ratio_of_the_two_explanations():
 
 def live(pattern, rules=RULES, dt=1):
     """Statuses after each scan of a 1-and-0 pattern; None once ended."""
-    tracks, statuses = Tracks.none(rules).born(1, 0, rules), []
-    statuses.append(int(tracks.status[0]))
+    tracks = Tracks.none(rules).born(1, 0, rules)
+    statuses = [int(tracks.status[0])]
     for k, symbol in enumerate(pattern[1:], start=1):
         tracks, kept = tracks.scan(np.array([symbol == '1']), k * dt, rules)
         if not kept[0]:
@@ -243,3 +250,173 @@ def test_identities_after_the_last_of_32_bits_are_those_that_no_track_has():
     assert (around[0].tolist(), around[1]) == ([1, 3, 4, 5], 6)
     assert new_ids(last, 1, tracks.track_id[:1])[1] == 1
     assert new_ids(last, 0, tracks.track_id)[1] == last
+
+
+def test_nees_by_hand():
+    error, P = np.array([[1.0, 2.0], [0.0, 3.0]]), np.array([[2.0, 0.5], [0.5, 1.0]])
+    expected = [e @ np.linalg.inv(P) @ e for e in error]
+    np.testing.assert_allclose(nees(error, P), expected, rtol=1e-13)
+    np.testing.assert_allclose(nis(error, P), expected, rtol=1e-13)
+
+
+def test_average_bounds_hold_as_often_as_they_say():
+    assert chi2.cdf(np.array(average_bounds(50, 4)) * 50, 200) == pytest.approx([0.025, 0.975])
+
+
+def test_coverage_by_hand():
+    truth, low = np.arange(5.0), np.array([-1.0, 1.1, 2.0, 2.9, 3.0])
+    high = low + [2.0, 1.0, 0.0, 0.2, 0.9]
+    assert interval_coverage(truth, low, high) == pytest.approx(0.6)
+    assert np.isnan(interval_coverage(np.empty(0), np.empty(0), np.empty(0)))
+
+
+# -- sets of targets ------------------------------------------------------------------------------
+
+POINTS = np.array([[0.0, 0.0], [10.0, 0.0]])
+NOTHING = np.empty((0, 2))
+
+
+@pytest.mark.parametrize(
+    'truth, estimate, expected',
+    [
+        (POINTS, POINTS, (0.0, 0.0, 0.0)),
+        (POINTS, POINTS[::-1] + [0.0, 1.0], (2.0, 0.0, 0.0)),
+        (POINTS, POINTS[:1], (0.0, 8.0, 0.0)),
+        (POINTS[:1], POINTS, (0.0, 0.0, 8.0)),
+        (POINTS[:1], POINTS[1:], (0.0, 8.0, 8.0)),
+        (NOTHING, POINTS, (0.0, 0.0, 16.0)),
+        (POINTS, NOTHING, (0.0, 16.0, 0.0)),
+        (NOTHING, NOTHING, (0.0, 0.0, 0.0)),
+    ],
+)
+def test_gospa_parts_by_hand(truth, estimate, expected):
+    result = gospa(truth, estimate, cutoff=4.0, order=2.0)
+    assert (result.localisation, result.missed, result.false) == pytest.approx(expected, abs=1e-12)
+    assert result.distance == pytest.approx(np.sqrt(sum(expected)), abs=1e-12)
+
+
+def test_ospa_by_hand():
+    assert ospa(POINTS, POINTS[:1], cutoff=4.0) == pytest.approx(np.sqrt(16.0 / 2), rel=1e-12)
+    assert ospa(POINTS, POINTS + [0.0, 1.0], cutoff=4.0) == pytest.approx(1.0, rel=1e-12)
+    assert ospa(NOTHING, NOTHING, cutoff=4.0) == 0.0
+    assert ospa(NOTHING, POINTS, cutoff=4.0) == 4.0
+
+
+def over_matchings(truth, estimate, c, p):
+    """GOSPA and OSPA over all partial matchings, by definition."""
+    both, most = len(truth) + len(estimate), max(len(truth), len(estimate))
+    sums = []
+    for choice in itertools.product(range(-1, len(estimate)), repeat=len(truth)):
+        pairs = [(t, d) for t, d in enumerate(choice) if d >= 0]
+        if len({d for _, d in pairs}) == len(pairs):
+            near = sum(np.linalg.norm(truth[t] - estimate[d]) ** p for t, d in pairs)
+            left = both - 2 * len(pairs), most - len(pairs)
+            sums.append((near + c**p / 2 * left[0], (near + c**p * left[1]) / max(most, 1)))
+    return np.min(sums, axis=0) ** (1 / p)
+
+
+SETS = (
+    st.integers(0, 2**32 - 1)
+    .map(lambda seed: np.random.default_rng(seed))
+    .map(lambda rng: tuple(rng.uniform(0, 6, (rng.integers(0, 5), 2)) for _ in range(2)))
+)
+
+
+@given(SETS, st.sampled_from([1.0, 2.0]))
+def test_both_are_the_least_over_all_matchings(sets, p):
+    found = gospa(*sets, 2.0, p).distance, ospa(*sets, 2.0, p)
+    assert found == pytest.approx(over_matchings(*sets, 2.0, p), abs=1e-9)
+
+
+@given(SETS)
+def test_stone_soup_agrees(sets):
+    metrics = pytest.importorskip('stonesoup.metricgenerator.ospametric')
+    states = pytest.importorskip('stonesoup.types.state')
+    now = datetime.datetime(2024, 1, 1)
+    truth, estimate = ([states.State(x, timestamp=now) for x in points] for points in sets)
+    if not truth and not estimate:
+        return  # Stone Soup cannot say what nothing is worth
+    ours = gospa(*sets, 2.0, 2.0)
+    theirs = metrics.GOSPAMetric(c=2.0, p=2.0).compute_gospa_metric(estimate, truth)[0].value
+    assert ours.distance == pytest.approx(theirs['distance'], abs=1e-9)
+    assert (ours.localisation, ours.missed, ours.false) == pytest.approx(
+        (theirs['localisation'], theirs['missed'], theirs['false']), abs=1e-9
+    )
+    # Order 1 only: for others Stone Soup assigns by distance and scores by distance to the order.
+    theirs = metrics.OSPAMetric(c=2.0, p=1.0).compute_OSPA_distance(estimate, truth)
+    assert ospa(*sets, 2.0, 1.0) == pytest.approx(theirs.value, abs=1e-9)
+
+
+def test_gospa_says_who_is_whom_and_refuses_nonsense():
+    result = gospa(POINTS, np.array([[10.0, 1.0], [50.0, 0.0], [0.5, 0.0]]), cutoff=4.0)
+    assert list(result.estimate_of) == [2, 0]
+    for arguments in ((0.0, 2.0), (1.0, 0.5)):
+        with pytest.raises(ValueError, match='cutoff > 0'):
+            gospa(POINTS, POINTS, *arguments)
+
+
+@pytest.mark.parametrize(
+    'ids, switches',
+    [
+        ([[1, 2], [1, 2], [1, 2]], [0, 0, 0]),
+        ([[1, 2], [2, 1]], [0, 2]),
+        ([[1, 2], [-1, 2], [1, 2]], [0, 0, 0]),
+        ([[1, 5], [-1, 5], [2, 5], [2, 6], [1, -1]], [0, 0, 1, 1, 1]),
+        ([[-1, -1]], [0]),
+        (np.empty((0, 2)), []),
+    ],
+)
+def test_a_switch_counts_at_the_scan_where_the_other_track_appears(ids, switches):
+    assert switches_by_scan(np.array(ids, int)).tolist() == switches
+    assert identity_switches(np.array(ids, int)) == sum(switches)
+
+
+def test_switching_gospa_is_the_root_mean_square_with_a_penalty_for_each_switch():
+    distance, switches = np.array([3.0, 4.0]), np.array([0, 2])
+    assert switching_gospa(distance, switches * 0, 5.0) == pytest.approx(np.sqrt(12.5))
+    assert switching_gospa(distance, switches, 5.0) == pytest.approx(np.sqrt(37.5))
+    assert np.isnan(switching_gospa(np.empty(0), np.empty(0, int), 5.0))
+
+
+# -- mean NIS of a memory, against closed forms and random numbers --------------------------------
+
+
+def test_the_memory_is_a_weighted_mean():
+    rng = np.random.default_rng(2)
+    nis, dof = rng.chisquare(3, 300), rng.integers(1, 4, 300)
+    memory = NisMemory()
+    for k in range(0, 300, 3):
+        memory = memory.after(nis[k : k + 3], dof[k : k + 3])
+    weight = (1.0 - 1.0 / NIS_MEMORY) ** np.arange(299, -1, -1)
+    assert (nis > 9.0 * dof).any()  # some are so far out that they count as nine
+    expected = weight @ np.minimum(nis, 9.0 * dof) / (weight @ dof)
+    assert memory.mean == pytest.approx(expected, rel=1e-12)
+    assert memory.square == pytest.approx(weight**2 @ dof, rel=1e-12)
+    assert memory.after(np.empty(0), 2) == memory
+
+
+def test_its_bounds_are_those_of_the_chi_square_of_the_same_variance():
+    memory = NisMemory()
+    for _ in range(2000):
+        memory = memory.after(np.array([2.0]), 2)
+    equivalent = memory.dof**2 / memory.square
+    assert equivalent == pytest.approx(2.0 * (2.0 * NIS_MEMORY - 1.0), rel=1e-9)
+    tail = 2.866516e-7  # of a Gaussian beyond five sigmas
+    low, high = memory.bounds
+    assert low == pytest.approx(chi2.ppf(tail, equivalent) / equivalent, rel=2e-3)
+    assert high == pytest.approx(chi2.isf(tail, equivalent) / equivalent, rel=2e-3)
+
+
+@pytest.mark.parametrize('factor, verdict', [(1.0, 0), (4.0, 1), (0.25, -1)])
+def test_true_words_are_believed_and_wrong_ones_are_not(factor, verdict):
+    rng = np.random.default_rng(3)
+    memory, verdicts = NisMemory(), []
+    for _ in range(5000):
+        memory = memory.after(factor * rng.chisquare(2, 1), 2)
+        verdicts.append(memory.verdict)
+    assert not any(verdicts[:68])  # too few
+    assert set(verdicts[200:]) == {verdict}
+    assert bool(memory.warnings('echoes', 'look')) == bool(verdict)
+    if verdict:
+        word = 'more' if verdict > 0 else 'less'
+        assert f'echoes miss by {word} than stated' in memory.warnings('echoes', 'look')[0]

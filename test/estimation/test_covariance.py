@@ -6,17 +6,24 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Covariances stay positive definite: cases no double can hold, exact fractions, and batches."""
+"""Kalman's update, Schmidt's and robust ones against closed forms and vectors; covariances stay
+positive definite: cases no double can hold, exact fractions, batches."""
 
 from fractions import Fraction
 
+from helpers.sea_vectors import vectors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose
+from oracles.student_t import DEGREES, student_t_constant, student_t_maximum
+from oracles.subset_update import subset_update
 import pytest
+from scipy.stats import multivariate_normal
 
 from sonar_imm.estimation import imm, kalman
+from sonar_imm.estimation.angles import wrap_angle
+from sonar_imm.estimation.consider import consider_scalar, consider_update
 from sonar_imm.estimation.covariance import (
     add_jitter,
     are_sound,
@@ -28,7 +35,87 @@ from sonar_imm.estimation.covariance import (
     semidefinite_roots,
     with_jitter,
 )
+from sonar_imm.estimation.kalman import CovarianceError
 from sonar_imm.trackers.obstacle import mixtures
+
+
+def random_covariance(rng, *shape):
+    root = rng.normal(size=(*shape, shape[-1] + 1))
+    return root @ np.swapaxes(root, -1, -2)
+
+
+def test_predict_moves_mean_and_spreads_covariance():
+    rng = np.random.default_rng(7)
+    x, F, b = rng.normal(size=3), rng.normal(size=(3, 3)), np.ones(3)
+    P, Q = random_covariance(rng, 3), random_covariance(rng, 3)
+    moved, spread, _ = kalman.predict(x, P, F, Q, b)
+    expected = [sum(F[i, j] * x[j] for j in range(3)) + 1.0 for i in range(3)]
+    np.testing.assert_allclose(moved, expected, rtol=1e-14)
+    np.testing.assert_allclose(spread, np.linalg.multi_dot([F, P, F.T]) + Q, rtol=1e-13)
+    np.testing.assert_array_equal(spread, spread.T)
+
+
+def test_update_equals_information_form_and_the_density_of_its_innovation():
+    rng = np.random.default_rng(7)
+    x, P, H = rng.normal(size=4), random_covariance(rng, 4), rng.normal(size=(2, 4))
+    R, z = random_covariance(rng, 2), rng.normal(size=2)
+    nu, S = z - H @ x, H @ P @ H.T + R
+    updated = kalman.update(x, P, nu, H, R)
+    information = np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H
+    np.testing.assert_allclose(updated.P, np.linalg.inv(information), rtol=1e-9, atol=1e-12)
+    due = np.linalg.inv(P) @ x + H.T @ np.linalg.inv(R) @ z
+    np.testing.assert_allclose(information @ updated.x, due, rtol=1e-9)
+    np.testing.assert_allclose(updated.innovation_covariance, S, rtol=1e-13)
+    density = multivariate_normal(cov=S).logpdf(nu)
+    np.testing.assert_allclose(updated.log_likelihood, density, rtol=1e-12)
+    np.testing.assert_allclose(updated.nis, nu @ np.linalg.inv(S) @ nu, rtol=1e-11)
+
+
+def test_a_batch_is_its_members():
+    rng = np.random.default_rng(7)
+    x, P = rng.normal(size=(5, 3, 4)), random_covariance(rng, 5, 3, 4)
+    F, Q, H = rng.normal(size=(3, 4, 4)), random_covariance(rng, 3, 4), rng.normal(size=(2, 4))
+    R, nu = random_covariance(rng, 5, 1, 2), rng.normal(size=(5, 3, 2))
+    px, pP, _ = kalman.predict(x, P, F, Q)
+    updated = kalman.update(px, pP, nu, H, R)
+    for t, m in np.ndindex(5, 3):
+        alone = kalman.update(
+            *kalman.predict(x[t, m], P[t, m], F[m], Q[m])[:2], nu[t, m], H, R[t, 0]
+        )
+        for whole, single in zip(updated, alone):
+            np.testing.assert_allclose(whole[t, m], single, rtol=1e-9, atol=1e-12)
+
+
+def test_a_perfect_measurement_is_allowed():
+    H = np.array([[1.0, 0.0]])
+    updated = kalman.update(np.zeros(2), np.eye(2), np.array([3.0]), H, np.zeros((1, 1)))
+    np.testing.assert_allclose(updated.x, [3.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(updated.P, [[0.0, 0.0], [0.0, 1.0]], atol=1e-12)
+    assert updated.P[0, 0] > 0.0 and updated.repaired
+
+
+def test_a_covariance_that_is_singular_or_nan_is_named():
+    P, H = np.stack([np.eye(2), np.zeros((2, 2)), np.eye(2)]), np.array([[1.0, 0.0]])
+    sentence = '1 of 3: innovation covariance is not positive definite'
+    with pytest.raises(CovarianceError, match=sentence) as caught:
+        kalman.update(np.zeros((3, 2)), P, np.zeros((3, 1)), H, np.zeros((1, 1)))
+    np.testing.assert_array_equal(caught.value.where, [False, True, False])
+    with pytest.raises(CovarianceError, match='innovation covariance is not finite'):
+        kalman.update(np.zeros(2), np.full((2, 2), np.nan), np.zeros(1), H, np.eye(1))
+
+
+@pytest.mark.parametrize('unit', [1e-20, 1.0, 1e20])
+def test_covariances_without_a_factor_are_named_in_any_unit(unit):
+    """The least eigenvalue is compared with the largest: what has none but for rounding counts."""
+    fine, flat, negative = np.diag([1.0, 2.0]), np.ones((2, 2)), np.diag([1.0, -1.0])
+    almost = np.array([[1.0, 1.0], [1.0, 1.0 + 4e-16]])
+    with pytest.raises(CovarianceError, match='2 of 3: state is not positive') as caught:
+        kalman.factorise(unit * np.array([fine, flat, negative]), 'state')
+    assert caught.value.where.tolist() == [False, True, True]
+    with pytest.raises(CovarianceError) as caught:
+        kalman.factorise(unit * np.array([negative, almost, fine]))
+    assert caught.value.where.tolist() == [True, True, False]
+
 
 ROUNDING = 1e-14
 
@@ -83,9 +170,9 @@ def ill_conditioned(rng, count, n, m):
 
 @pytest.mark.parametrize(('n', 'm', 'seed'), [(2, 1, 0), (3, 2, 1), (4, 2, 2), (4, 1, 3)])
 def test_ill_conditioned_cases_stay_positive_definite(n, m, seed):
-    """A thousand of each size, ten steps of the same measurement each."""
+    """Hundreds of each size, ten steps of the same measurement each."""
     rng = np.random.default_rng(seed)
-    count = 1000
+    count = 400
     P, F, Q, H, R = ill_conditioned(rng, count, n, m)
     x, v = np.zeros((1, count, n)), np.zeros((1, count, m))
     B = np.zeros((count, n))
@@ -191,8 +278,7 @@ def test_a_shared_drift_leaves_its_correlation():
 
 def test_ordinary_covariances_keep_their_bits():
     rng = np.random.default_rng(6)
-    root = rng.normal(size=(50, 4, 6))
-    P = root @ np.swapaxes(root, -1, -2)
+    P = random_covariance(rng, 50, 4)
     P = 0.5 * (P + np.swapaxes(P, -1, -2))
     P[0] = np.diag([1.0, 0.0, 2.0, 3.0])  # nothing to lift where there is no variance
     P[1] = 0.0
@@ -318,3 +404,130 @@ def test_jitter_is_the_least_power_of_ten_that_cures(n):
         if share.min() > 5.0 * JITTER:
             less = P[k] + np.diag(0.1 * share.min() * own)
             assert not is_psd(less)
+
+
+def test_the_update_of_the_vectors():
+    v = vectors('consider_update')
+    x, P = consider_update(
+        v['x'], v['P'], v['H'], v['R'], v['innovation'], v['estimated'].astype(bool)
+    )
+    np.testing.assert_allclose(x, v['out_x'], atol=1e-9)
+    np.testing.assert_allclose(P, v['out_P'], atol=1e-9)
+    assert (P == P.T).all()
+
+
+@pytest.mark.parametrize('mask', [[True] * 5, [True, True, True, False, False], [False] * 5])
+def test_numbers_one_by_one_equal_the_joint_update(mask):
+    """In turn they are the joint update but for Schmidt's gain: that is compared with numpy."""
+    v, mask = vectors('consider_update'), np.array(mask)
+    x, P = v['x'].copy(), v['P'].copy()
+    y = v['innovation'] + v['H'] @ x
+    plain_x, plain_P = x.copy(), P.copy()
+    for h, R, value in zip(v['H'], np.diag(v['R']), y):
+        nu = value - h @ x
+        expected = -0.5 * (nu**2 / (h @ P @ h + R) + np.log(2 * np.pi * (h @ P @ h + R)))
+        # two filters at once, the same
+        xs, Ps = np.stack([x, x], 1), np.stack([P, P], 2)
+        fit = consider_scalar(xs, Ps, np.stack([h, h], 1), R, np.array([nu, nu]), mask)
+        assert fit == pytest.approx([expected, expected])
+        x, P = xs[:, 1], Ps[..., 1]
+        plain_x, plain_P = consider_update(
+            plain_x, plain_P, h[None], np.array([[R]]), np.array([value - h @ plain_x]), mask
+        )
+        np.testing.assert_allclose(x, plain_x, atol=1e-12)
+        np.testing.assert_allclose(P, plain_P, atol=1e-12)
+    if mask.all():
+        joint = consider_update(v['x'], v['P'], v['H'], v['R'], v['innovation'], mask)
+        np.testing.assert_allclose(x, joint[0], atol=1e-12)
+        np.testing.assert_allclose(P, joint[1], atol=1e-12)
+    if not mask.any():
+        np.testing.assert_array_equal(x, v['x'])
+
+
+def test_a_considered_bias_is_never_averaged_away():
+    v = vectors('consider_static')
+    P = np.diag([v['p0'], v['bias_var']])
+    for expected in v['out_var']:
+        _, P = consider_update(
+            np.zeros(2), P, np.ones((1, 2)), v['r'][None, None], np.zeros(1),
+            np.array([True, False]),
+        )  # fmt: skip
+        assert P[0, 0] == pytest.approx(expected, rel=1e-9)
+        assert P[0, 0] > v['bias_var'] and P[1, 1] == v['bias_var']
+
+
+def test_covariances_stay_symmetric_and_positive_over_many_updates():
+    rng = np.random.default_rng(1)
+    n, mask = 8, np.arange(8) < 5
+    A = rng.normal(size=(n, n))
+    x, P = np.zeros(n), A @ A.T
+    for _ in range(2000):
+        x, P = consider_update(
+            x, P + 0.01 * np.diag(mask), rng.normal(size=(1, n)), np.eye(1), np.ones(1), mask
+        )
+    assert (P == P.T).all() and np.linalg.eigvalsh(P).min() > 0.0
+
+
+# -- the oracles of robust updates: all inlier/outlier subsets, and heavy tails -------------------
+
+
+def test_the_subsets_of_the_vectors():
+    v = vectors('subsets')
+    numbers = [
+        (lambda x, h=h: (float(h @ x), h), float(y), float(v['sigma'] ** 2))
+        for h, y in zip(v['H'], v['y'])
+    ]
+    law = float(v['outlier_probability']), float(v['outlier_density'])
+    got = subset_update(v['x'], v['P'], numbers, *law, prune=np.inf)
+    np.testing.assert_array_equal(got.subsets, v['out_subsets'] == 1)
+    np.testing.assert_allclose(got.probability, v['out_subset_prob'], atol=1e-9)
+    assert got.log_evidence == pytest.approx(float(v['out_log_evidence']), abs=1e-9)
+    np.testing.assert_allclose(got.x, v['out_x'], atol=1e-9)
+    np.testing.assert_allclose(got.P, v['out_P'], atol=1e-9)
+
+
+def test_the_maximum_of_the_vectors():
+    """x, y and the emission, whose prior is flat; weights, Laplace covariance and evidence."""
+    v = vectors('robust')
+
+    def measure(rx):
+        def of(x):
+            d = np.array([*(x[:2] - rx[:2]), float(v['z']) - rx[2]])
+            r = np.sqrt(d @ d)
+            return r + x[2], np.array([d[0] / r, d[1] / r, 1.0])
+
+        return of
+
+    variance = float(v['sigma']) ** 2
+    numbers = [(measure(rx), float(y), variance) for rx, y in zip(v['rx'], v['path'])]
+    P = np.zeros((3, 3))
+    P[:2, :2], P[2, 2] = v['prior_cov'], 1e8
+    mean = np.append(v['prior_mean'], 0.0)
+    got = student_t_maximum(mean, P, numbers, [mean, np.append(v['out_least_squares'], 0.0)])
+    np.testing.assert_allclose(got.x[:2], v['out_map'], atol=1e-5)
+    assert got.x[2] == pytest.approx(float(v['out_te']), abs=1e-5)
+    np.testing.assert_allclose(got.weights, v['out_weights'], atol=1e-5)
+    np.testing.assert_allclose(got.P[:2, :2], v['out_cov_laplace'], atol=1e-5)
+    # The evidence of the vectors has no constants of the prior nor of the t density.
+    assert v['nu'] == DEGREES
+    constants = 6 * student_t_constant(float(v['sigma']) ** 2)
+    bare = got.log_evidence - constants + 0.5 * np.log(np.linalg.det(P)) + 1.5 * np.log(2 * np.pi)
+    assert bare == pytest.approx(float(v['out_log_evidence_laplace']), abs=1e-4)
+
+
+# -- angles ---------------------------------------------------------------------------------------
+
+
+def test_angles_keep_their_direction_and_those_inside_their_bits():
+    inside = np.concatenate([np.linspace(-np.pi, np.pi, 1001), [0.1, -0.0, 1e-300]])
+    assert (wrap_angle(inside) == inside).all()
+    angles = np.linspace(-20.0, 20.0, 1001)
+    wrapped = wrap_angle(angles)
+    assert (np.abs(wrapped) <= np.pi + 1e-15).all()
+    np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angles), atol=1e-14)
+    np.testing.assert_allclose(wrap_angle(1e12), np.angle(np.exp(1e12j)), atol=1e-3)
+    np.testing.assert_allclose(
+        wrap_angle([3.5 * np.pi, -0.1, np.pi + 1e-3]), [-0.5 * np.pi, -0.1, -np.pi + 1e-3]
+    )
+    assert wrap_angle(4.0) == 4.0 - 2.0 * np.pi
+    assert np.isnan(wrap_angle([np.nan])).all()

@@ -6,8 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Compiled kernels are kept where they can be, and what goes wrong with that is one sentence."""
+"""Compiled kernels are kept where they can be, what goes wrong with that is one sentence, and what
+numba keeps of a kernel file is right for as long as the file is."""
 
+import ast
 import os
 from pathlib import Path
 import shutil
@@ -35,6 +37,12 @@ def begin(code, cache, *, root=PACKAGE.parent, arguments=(), **environment):
         env={**environment, 'PYTHONPATH': str(root)}, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
+
+
+def alone(folder, text):
+    """Code that runs this file of kernels."""
+    (folder / 'alone.py').write_text(text)
+    return f'import sys; sys.path.append({str(folder)!r}); import alone'
 
 
 def run(code, cache, **options):
@@ -66,7 +74,6 @@ def test_what_was_done_is_a_sentence(warm):
 DAMAGE = {
     'a flipped byte': lambda content: bytes([content[0] ^ 4]) + content[1:],
     'cut': lambda content: content[:-9],
-    'empty': lambda content: b'',
 }
 
 
@@ -116,13 +123,13 @@ def test_a_full_disk_ends_the_command_with_one_sentence(tmp_path):
 def test_without_a_folder_that_can_be_written_each_process_compiles(tmp_path):
     """As in a container whose files cannot be written and that has no home."""
     (tmp_path / '__pycache__').touch()
-    (tmp_path / 'alone.py').write_text(
+    code = alone(
+        tmp_path,
         'from sonar_imm.estimation.jit import counts, kernel\n'
         'doubled, halved = kernel(lambda x: 2.0 * x), kernel(lambda x: 0.5 * x)\n'
-        'print(doubled(2.0), halved(2.0), *counts())\n'
+        'print(doubled(2.0), halved(2.0), *counts())\n',
     )
     nowhere = {'HOME': os.devnull, 'XDG_CACHE_HOME': os.devnull}
-    code = f'import sys; sys.path.append({str(tmp_path)!r}); import alone'
     for _ in range(2):
         out, errors, _ = run(code, os.devnull, **nowhere)
         assert out.split() == ['4.0', '1.0', '2', '0']
@@ -136,7 +143,8 @@ TARGET = Path(__file__).parents[2] / 'docker' / 'numba_target.sh'
 @pytest.mark.parametrize('anywhere', [False, True])
 def test_kernels_of_an_image_load_on_another_processor(tmp_path, anywhere):
     """LLVM is made to find another processor; without the target, that one compiles anew."""
-    (tmp_path / 'alone.py').write_text(
+    file = tmp_path / 'alone.py'
+    file.write_text(
         'import sys\n'
         'import llvmlite.binding as llvm\n'
         'llvm.get_host_cpu_name = lambda: sys.argv[1]\n'
@@ -150,72 +158,142 @@ def test_kernels_of_an_image_load_on_another_processor(tmp_path, anywhere):
     start = f'{source}exec "$2" "$3" "$4"'
     found = []
     for processor in (llvm.get_host_cpu_name(), 'x86-64'):
-        words = [
-            'sh', '-ec', start, 'sh', TARGET, sys.executable, tmp_path / 'alone.py', processor,
-        ]  # fmt: skip
+        words = ['sh', '-ec', start, 'sh', TARGET, sys.executable, file, processor]
         done = subprocess.run(words, env=environment, capture_output=True, text=True)
         found.append(done.stdout.split())
     assert found == [['4.0', '1', '0'], ['4.0', '0', '1'] if anywhere else ['4.0', '1', '0']]
 
 
 def test_a_processor_that_was_chosen_stays():
-    words = [
-        'sh', '-ec', '. "$1"; echo "$NUMBA_CPU_NAME ${NUMBA_CPU_FEATURES-none}"', 'sh', TARGET,
-    ]  # fmt: skip
+    told = '. "$1"; echo "$NUMBA_CPU_NAME ${NUMBA_CPU_FEATURES-none}"'
+    words = ['sh', '-ec', told, 'sh', TARGET]
     environment = {**os.environ, 'NUMBA_CPU_NAME': 'skylake'}
     environment.pop('NUMBA_CPU_FEATURES', None)
     assert subprocess.check_output(words, env=environment, text=True) == 'skylake none\n'
 
 
 def test_a_constant_that_changes_changes_the_result(tmp_path):
-    """`normals` has ln 2 from its file, which a numba that looks at the kernel alone forgets."""
-    root, cache = tmp_path / 'copy', tmp_path / 'cache'
-    shutil.copytree(PACKAGE, root / 'sonar_imm', ignore=shutil.ignore_patterns('__pycache__'))
-    code = """
-import numpy as np
-from sonar_imm.estimation.jit import counts
-from sonar_imm.trackers.bathymetry.filter_kernels import normals
-uniform, out = np.array([0.5, 0.0]), np.empty(2)
-normals(uniform, uniform.view(np.int64), out, out.view(np.int64))
-print(round(out[0], 4), 'loaded' if counts()[1] else 'compiled')
+    """A numba that looks at the kernel alone forgets what it has from its file."""
+    text = """
+import math
+from sonar_imm.estimation.jit import counts, kernel
+LN_2 = math.log(2.0)
+@kernel
+def scaled(x):
+    return x / LN_2
+print(round(scaled(1.0), 4), *counts())
 """
-    assert run(code, cache, root=root)[0].split() == ['1.1774', 'compiled']
-    assert run(code, cache, root=root)[0].split() == ['1.1774', 'loaded']
-    file = root / 'sonar_imm/trackers/bathymetry/filter_kernels.py'
-    text = file.read_text()
-    assert text.count('LN_2 = math.sqrt(2.0), math.log(2.0)') == 1
-    file.write_text(text.replace('math.log(2.0)\nMANTISSA', '4.0 * math.log(2.0)\nMANTISSA'))
-    assert run(code, cache, root=root)[0].split() == ['2.3548', 'compiled']
+    code, cache = alone(tmp_path, text), tmp_path / 'cache'
+    assert run(code, cache)[0].split() == ['1.4427', '1', '0']
+    assert run(code, cache)[0].split() == ['1.4427', '0', '1']
+    alone(tmp_path, text.replace('LN_2 =', 'LN_2 = 2.0 *'))
+    assert run(code, cache)[0].split() == ['0.7213', '1', '0']
 
 
 def test_of_processes_that_begin_at_once_one_compiles(tmp_path):
     """Two begin with an empty folder, a third loads what they left: all give the same bits."""
-    code = """
-import hashlib, sys, time
-import numpy as np
+    text = """
+import math, sys, time
 from pathlib import Path
-from sonar_imm.estimation.jit import counts
-from sonar_imm.measurements import Trace
+from sonar_imm.estimation.jit import counts, kernel
 from sonar_imm.trackers import SYSTEMS
-tracker = SYSTEMS['fathometer'].build(SYSTEMS['fathometer'].config_type()())
+@kernel
+def series(x):
+    total = 0.0
+    for k in range(1, 50):
+        total += math.sin(x / k)
+    return total
+class Tracker:
+    def warm(self, inputs):
+        series(1.0), series(1)
 start, me = Path(sys.argv[1]), sys.argv[2]
 (start / me).touch()
 while len(list(start.iterdir())) < 2:
     time.sleep(0.001)
-SYSTEMS['fathometer'].warm(tracker)
-depth, made = 0.05 * np.arange(200), hashlib.sha256()
-for second in (1, 2):
-    trace = Trace(stamp_ns=second * 10**9, depth=depth, amplitude=np.exp(-np.square(depth - 5.0)))
-    for estimate in tracker.process(trace):
-        made.update(estimate.state.tobytes())
-print(made.hexdigest(), *counts())
+SYSTEMS['diver'].warm(Tracker())
+print(series(3.0).hex(), *counts())
 """
     start, cache = tmp_path / 'start', tmp_path / 'cache'
     start.mkdir()
+    code = alone(tmp_path, text)
     both = [begin(code, cache, arguments=(str(start), name)) for name in 'ab']
     made = [process.communicate() for process in both]
     words = [out.split() for out, _ in made]
-    assert sorted(each[1:] for each in words) == [['0', '4'], ['4', '0']], made
+    assert sorted(each[1:] for each in words) == [['0', '2'], ['2', '0']], made
     loaded = run(code, cache, arguments=(str(start), 'c'))[0].split()
-    assert loaded[1:] == ['0', '4']
+    assert loaded[1:] == ['0', '2']
     assert {loaded[0], *(each[0] for each in words)} == {loaded[0]}
+
+
+TYPES = {'BoolArray', 'ComplexArray', 'FloatArray', 'IndexArray', 'IntArray'}
+ALLOWED = {
+    'numpy': {'np'}, 'numpy.typing': {'NDArray'}, 'math': {'math'}, 'numba': {'numba'},
+    'typing': {'Any'},
+    **dict.fromkeys(('.jit', '..estimation.jit', '...estimation.jit'), {'kernel'}),
+    '__future__': {'annotations'}, **dict.fromkeys(('.arrays', '...estimation.arrays'), TYPES),
+}  # fmt: skip
+"""What may be imported, and by which names; of `arrays` the names of types, which no code uses."""
+
+
+def imported(tree):
+    """(module, name) of all that is imported anywhere in a file."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, alias.asname or alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = '.' * node.level + (node.module or '')
+            yield from ((module, alias.asname or alias.name) for alias in node.names)
+
+
+def kernels_of(tree):
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+    decorated = (f for f in functions if [ast.unparse(d) for d in f.decorator_list] == ['kernel'])
+    return {function.name for function in decorated}
+
+
+# -- a kernel file stands alone: compiled code contains the kernels it calls and the constants it
+# names, and numba compiles anew when a kernel's own file changes, but looks at no other ----------
+
+ALONE = sorted(
+    path.relative_to(PACKAGE).as_posix()
+    for path in PACKAGE.rglob('*.py')
+    if kernels_of(ast.parse(path.read_text()))
+)
+
+
+@pytest.mark.parametrize('name', ALONE)
+def test_a_kernel_file_imports_no_code_of_another_and_a_kernel_has_its_helpers_in_it(name):
+    """Called from two kernels a helper would be compiled three times."""
+    tree = ast.parse((PACKAGE / name).read_text())
+    wrong = [(module, own) for module, own in imported(tree) if own not in ALLOWED.get(module, ())]
+    assert wrong == []
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+    kernels = kernels_of(tree)
+    assert kernels and len(kernels) == len(functions)
+    called = {
+        node.func.id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    }
+    assert not called & kernels
+
+
+def test_a_shift_is_compiled_where_it_is_configured_only():
+    program = """
+import sys
+import numpy as np
+from sonar_imm.estimation.set_filter import SetFilter
+from sonar_imm.estimation.set_model import SetModel, gaussian_walk
+from sonar_imm.estimation.set_shifts import Shift
+for shift in (None, Shift(std=1.0)):
+    model = SetModel(cells=20, separation=3, order_min=1, transition=[[1.0]], shift=shift,
+                     walk=gaussian_walk(1.0), gram=np.eye(1, 20)[0])
+    tracker = SetFilter(model, 5)
+    record = tracker.record(np.ones(model.record_cells), (1, 2))
+    tracker.propagate(tracker.start(record), record)
+    print('sonar_imm.estimation.set_shift_kernels' in sys.modules)
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', program], capture_output=True, text=True, cwd=PACKAGE.parent
+    )
+    assert done.stdout.split() == ['False', 'True'], done.stderr

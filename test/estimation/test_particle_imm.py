@@ -7,18 +7,22 @@
 # language governing permissions and limitations under the License.
 
 """The particle filter of several models against exact filters: a hidden Markov model, Kalman's,
-and a tree of all mode sequences."""
+and a tree of all mode sequences. And its parts: log weights, effective sample size, resampling."""
 
 import math
 import subprocess
 import sys
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 
 from sonar_imm import ParticleIMM
-from sonar_imm.estimation import kalman
+from sonar_imm.estimation import kalman, particles
 from sonar_imm.estimation.markov import RateChain
+from sonar_imm.estimation.particles import invert, systematic
 
 T = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
 TWO = np.array([[0.95, 0.05], [0.3, 0.7]])
@@ -95,18 +99,16 @@ def test_static_states_beside_models_are_a_larger_hidden_markov_model():
     exact = joint[-1].reshape(3, 4)
     mean = exact.sum(axis=0) @ bottoms
     variance = exact.sum(axis=0) @ (bottoms - mean) ** 2
+    sensors = {
+        name: lambda x, z, e=e: np.log(e[x[:, 0].astype(int), z])
+        for name, e in zip('abc', emission)
+    }
     runs = []
     for seed in range(40):
         tracker = ParticleIMM(
-            dict.fromkeys('abc', still),
-            T,
-            np.tile(bottoms, 200)[:, None],
-            {
-                name: lambda x, z, e=e: np.log(e[x[:, 0].astype(int), z])
-                for name, e in zip('abc', emission)
-            },
+            dict.fromkeys('abc', still), T, np.tile(bottoms, 200)[:, None], sensors,
             np.random.default_rng(seed),
-        )
+        )  # fmt: skip
         total = 0.0
         for echo in echoes:
             tracker.step(echo)
@@ -172,9 +174,7 @@ def tree(transition, z, variance=0.25):
     weight = np.exp(log - log.max())
     total, weight = log.max() + math.log(weight.sum()), weight / weight.sum()
     mean = weight @ x
-    return [
-        *np.bincount(mode, weight), mean, weight @ (P + (x - mean) ** 2), total
-    ]  # fmt: skip
+    return [*np.bincount(mode, weight), mean, weight @ (P + (x - mean) ** 2), total]
 
 
 Z = np.array([0.1, -0.3, 0.4, 1.7, 2.2, 2.5, 3.9, 4.0])
@@ -295,9 +295,6 @@ GOOD = {
     [
         ({'models': {}}, 'at least one'),
         ({'transition': np.eye(3)}, '2 x 2 and 2 probabilities'),
-        ({'transition': [[0.5, 0.4], [0.0, 1.0]]}, 'row 0 of the transition matrix sums to 0.9'),
-        ({'initial': [1.5, -0.5]}, '2 probabilities'),
-        ({'dt': 0.0}, 'dt has to be positive'),
         ({'particles': np.ones(10)}, r'\(N, n\) or \(2, N, n\), got shape \(10,\)'),
         ({'particles': np.ones((3, 10, 2))}, r'got shape \(3, 10, 2\)'),
         ({'particles': np.full((10, 2), np.nan)}, 'finite'),
@@ -378,3 +375,67 @@ def test_the_package_shows_its_names_before_they_are_imported():
     names, loaded = shown.stdout.splitlines()
     assert "'IMM'" in names and "'ParticleIMM'" in names and 'import_module' not in names
     assert loaded == 'False'
+
+
+# -- weighted particles ---------------------------------------------------------------------------
+
+
+def test_normalise_survives_what_underflows_and_nothing_is_uniform():
+    log_w = np.array([-1e5, -1e5 + np.log(3.0), -np.inf])
+    w, log_sum = particles.normalise(log_w)
+    assert w == pytest.approx([0.25, 0.75, 0.0])
+    assert log_sum == pytest.approx(logsumexp(log_w))
+    w, log_sum = particles.normalise(np.full((2, 4), -np.inf))
+    assert (w == 0.25).all() and np.isneginf(log_sum).all()
+
+
+def test_effective_sample_size_lies_between_one_and_all():
+    assert particles.effective_sample_size(np.full(50, 0.02)) == pytest.approx(50.0)
+    assert particles.effective_sample_size(np.eye(1, 50)[0]) == pytest.approx(1.0)
+
+
+W = np.array([0.05, 0.0, 0.4, 0.15, 0.3, 0.1])
+
+
+def test_each_particle_is_drawn_as_often_as_its_weight_says():
+    rng = np.random.default_rng(1)
+    runs, count = 5000, 7
+    copies = np.zeros((runs, len(W)))
+    for run in range(runs):
+        copies[run] = np.bincount(systematic(W, count, rng), minlength=len(W))
+    error = copies.std(axis=0) / np.sqrt(runs)
+    assert (np.abs(copies.mean(axis=0) - count * W) <= 4.5 * error + 1e-12).all()
+    assert (copies[:, 1] == 0).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.lists(st.floats(0.0, 1.0), min_size=1, max_size=40).filter(lambda w: sum(w) > 1e-9),
+    st.integers(0, 60),
+    st.integers(0, 2**32),
+)
+def test_systematic_copies_differ_from_the_expectation_by_less_than_one(weights, count, seed):
+    w = np.array(weights)
+    expected = count * w / w.sum()
+    drawn = systematic(w, count, np.random.default_rng(seed))
+    assert (drawn == systematic(2.0**-600 * w, count, np.random.default_rng(seed))).all()
+    copies = np.bincount(drawn, minlength=len(w))
+    assert (copies >= np.floor(expected - 1e-9)).all()
+    assert (copies <= np.ceil(expected + 1e-9)).all()
+    assert drawn.shape == (count,) and (np.diff(drawn) >= 0).all()
+
+
+@pytest.mark.parametrize(
+    'weights', [[], [0.0, 0.0], [1.0, -0.1], [1.0, np.nan], [1.0, np.inf], [[1.0, 2.0]]]
+)
+def test_what_are_no_weights_is_refused(weights):
+    with pytest.raises(ValueError, match='weights'):
+        systematic(weights, 3, np.random.default_rng(0))
+
+
+def test_a_point_on_a_boundary_belongs_to_what_begins_there():
+    """Zero is not of a first particle without weight, the very end is of the last one with it."""
+    cumulative = np.cumsum([0.0, 0.25, 0.0, 0.25, 0.5])
+    assert invert(cumulative, np.array([0.0, 0.25, 0.375, 0.5])).tolist() == [1, 3, 3, 4]
+    cumulative = np.cumsum([0.3, 0.7, 0.0])
+    assert invert(cumulative, np.array([0.0, 1.0 - 2.0**-53, 1.0])).tolist() == [0, 1, 1]

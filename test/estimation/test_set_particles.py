@@ -18,12 +18,7 @@ import numpy as np
 from oracles.set_particles import propagate, propose, start, weigh
 import pytest
 
-from sonar_imm.estimation.set_filter import (
-    LagSmoother,
-    levelled,
-    SetFilter,
-    Weighted,
-)
+from sonar_imm.estimation.set_filter import LagSmoother, levelled, SetFilter, Weighted
 from sonar_imm.estimation.set_members import find_members
 from sonar_imm.estimation.set_model import (
     aged,
@@ -36,6 +31,7 @@ from sonar_imm.estimation.set_model import (
 )
 from sonar_imm.estimation.set_shifts import Jump, Shift, ShiftPath
 
+KEY = np.array([1, 2], np.uint64)
 JUMP = Jump(probability=0.2, std=4.0, step=2, reach=5)
 
 
@@ -49,9 +45,9 @@ def model():
     return exact_hmm_model()
 
 
-def run(model, records, particles, seed, threads=1):
+def run(model, records, particles, seed):
     """PMFs (T, orders), intensities (T, n), log evidence."""
-    tracker, before = SetFilter(model, particles, threads), None
+    tracker, before = SetFilter(model, particles), None
     pmfs, intensities, evidence = [], [], 0.0
     for name, b in enumerate(records):
         step = cycle(tracker, before, b, (seed, name))
@@ -120,11 +116,9 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
     b = np.pad(exact['B'][3], changed.pad)
     record = tracker.record(b, (1, 2))
     before, peaks = tracker.start(record), len(record.found[1].first)
-    uniform = np.random.Generator(
-        np.random.Philox(
-            key=np.array([1, 2], np.uint64), counter=np.array([0, 0, 0, 1], np.uint64)
-        )
-    ).random((N, 1 + changed.order_max + (changed.shift is not None) + peaks))
+    counter = np.array([0, 0, 0, 1], np.uint64)
+    drawn = np.random.Generator(np.random.Philox(key=KEY, counter=counter))
+    uniform = drawn.random((N, 1 + changed.order_max + (changed.shift is not None) + peaks))
     sets, ratio = start(changed, propose(changed, b), b, uniform)
     assert np.allclose(before.log_weight, ratio)
     possible = np.isfinite(ratio)
@@ -138,9 +132,7 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
         prior_mean=rng.uniform(-1.0, 3.0, before.sets.cell.shape),
         prior_variance=rng.uniform(0.5, 4.0, before.sets.cell.shape),
     )
-    uniform = np.random.Generator(np.random.Philox(key=np.array([1, 2], np.uint64))).random(
-        (N, changed.uniforms)
-    )
+    uniform = np.random.Generator(np.random.Philox(key=KEY)).random((N, changed.uniforms))
     propagated = tracker.propagate(Weighted(sets, np.zeros(N)), record)
     moved, ratio = propagated.sets, propagated.log_weight
     expected, wanted = propagate(changed, propose(changed, b), sets, uniform)
@@ -172,7 +164,7 @@ def test_what_is_kept_of_equal_sets_changes_no_bit(model, exact, change):
     tracker, N = SetFilter(changed, 600), 600
     b = np.pad(exact['B'][3], changed.pad)
     record = tracker.record(b, (1, 2))
-    sets = tracker.start(record).sets.take(np.random.default_rng(0).integers(0, 90, N))
+    sets = tracker.start(record).sets.take(np.random.default_rng(0).integers(0, 500, N))
     uniform = np.random.default_rng(3).random((N, changed.uniforms))
     moved, ratio, jump = tracker._drawn(sets, record, uniform)
     step = tracker.weigh(Weighted(moved, np.zeros(N)), record)
@@ -230,8 +222,7 @@ def test_marginal_amplitudes_are_integrated_out():
 
 def test_what_came_later_corrects_what_was_known(model, exact):
     tracker, smoother, before = SetFilter(model, 5000), LagSmoother(3), None
-    right_then, right_later = [], []
-    pmfs = []
+    right_then, right_later, pmfs = [], [], []
     for name, b in enumerate(exact['B']):
         step = cycle(tracker, before, b, (4, name))
         before = step.after
@@ -252,6 +243,8 @@ def test_nothing_is_corrected_across_a_record_that_nothing_explains(model, exact
     for name, b in enumerate([*exact['B'][:3], np.full(60, -5.0), *exact['B'][3:6]]):
         step = cycle(tracker, before, b, (4, name))
         before = step.after if step.ok else None
+        assert step.ok == (name != 3) == (step.log_evidence > -math.inf)
+        assert step.w.sum() == pytest.approx(1.0)
         found.append(smoother.push(step) is not None)
     assert found == [False, False, True, False, False, False, True]
 
@@ -280,13 +273,6 @@ def test_sets_are_resampled_when_few_of_them_count_and_only_then(model, exact):
     assert kept >= 5 and drawn >= 5
 
 
-def test_a_record_nothing_explains_is_said_so(model):
-    step = cycle(SetFilter(model, 100), None, np.full(60, -5.0), (0, 1))
-    assert not step.ok
-    assert step.log_evidence == -math.inf
-    assert step.w.sum() == pytest.approx(1.0)
-
-
 @pytest.mark.parametrize('value', [1e200, np.inf, np.nan])
 def test_a_record_beyond_numbers_keeps_members_on_the_lattice(model, exact, value):
     tracker, before = SetFilter(model, 50), None
@@ -308,9 +294,7 @@ def test_models_that_cannot_be_are_refused(model):
     ):
         with pytest.raises(ValueError):
             evolve(model, **change)
-
-
-def test_room_counts_the_possible_sets(model):
+    # The room that is left is counted in possible sets.
     pairs = sum(1 for i in range(60) for j in range(i) if i - j >= 3)
     assert [model.room(m) for m in (0, 1, 2)] == [1, 60, pairs]
 
@@ -337,14 +321,11 @@ def test_each_hill_is_a_member():
     assert found.covariance[0] == pytest.approx(np.array([[1.0, 0.0], [0.0, 0.25]]), abs=0.01)
 
 
-def test_no_more_than_asked_and_none_that_is_not_believed():
+def test_no_more_than_asked_none_that_is_not_believed_and_one_at_the_edge():
     sums = hills((20, 0.9, 5.0), (50, 0.3, 1.0), (70, 0.6, 2.0))
     assert len(find_members(sums, 10, 2, 0.0).place) == 2
     assert find_members(sums, 10, 9, 0.5).place == pytest.approx([20.0, 70.0], abs=0.01)
     assert len(find_members(np.zeros((5, 100)), 10, 9, 0.0).place) == 0
-
-
-def test_a_member_at_the_edge_and_a_separation_of_one():
     sums = np.zeros((5, 4))
     sums[:, 0] = 0.8, 0.8, 0.9, 1.6, 0.4
     found = find_members(sums, 1, 3, 0.1)
@@ -364,9 +345,7 @@ def test_of_two_humps_the_greater_is_reported_with_its_own_spread():
     # That there is a member is as sure as before, wherever it is.
     assert mode.existence == pytest.approx(mean.existence) and mode.existence > 0.9
     assert mode.foremost == pytest.approx(mean.foremost)
-
-
-def test_one_hump_and_what_is_rare_beside_it_stay_whole():
+    # One hump and what is rare beside it stay whole.
     sums = hills((40, 0.9, 5.0), (52, 0.05, 3.0))
     with_modes = find_members(sums, 16, 1, 0.5, modes=True)
     for found, expected in zip(with_modes, find_members(sums, 16, 1, 0.5)):
@@ -395,7 +374,7 @@ def test_the_sum_of_walks_is_their_convolution():
     assert np.sqrt(long @ np.square(place)) == pytest.approx(2.0 * np.sqrt(50.0), rel=0.01)
 
 
-@pytest.mark.parametrize(('least', 'records'), [(0, 1), (1, 2), (3, 1), (0, 7), (3, 7)])
+@pytest.mark.parametrize(('least', 'records'), [(0, 1), (1, 2), (3, 7)])
 def test_who_left_and_was_replaced(least, records):
     """Against members that are drawn one by one."""
     P = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.3, 0.1, 0.6]])
@@ -404,7 +383,7 @@ def test_who_left_and_was_replaced(least, records):
     assert orders == pytest.approx(np.linalg.matrix_power(P, records), abs=1e-12)
     rng, drawn = np.random.default_rng(0), np.zeros_like(found)
     for first in range(3):
-        for _ in range(3000):
+        for _ in range(2000):
             old, members, j = set(range(least + first)), list(range(least + first)), first
             for _ in range(records):
                 j = rng.choice(3, p=P[j])
@@ -412,17 +391,21 @@ def test_who_left_and_was_replaced(least, records):
                 members = members[: least + j]
                 members += [-1] * (least + j - len(members))
             extra = least + min(first, j) - len(old & set(members))
-            drawn[first, 3 * extra + j] += 1.0 / 3000
-    assert np.abs(found - drawn).max() < 0.035
+            drawn[first, 3 * extra + j] += 1.0 / 2000
+    assert np.abs(found - drawn).max() < 0.04
+
+
+def two(tracker, b, count):
+    """So many sets of two positive members, at 100 and 250."""
+    sets = tracker.start(tracker.record(b, (0, 0))).sets
+    sets.order[:], sets.cell[:, :2], sets.sign[:] = 2, (100, 250), 1
+    return Weighted(sets, np.zeros(count))
 
 
 def prior(wide, steps, records):
-    """Sets of two members, at 100 and 250, after so many steps without any record."""
-    tracker = SetFilter(wide, SETS)
-    b = np.zeros(wide.record_cells)
-    sets = tracker.start(tracker.record(b, (0, 0))).sets
-    sets.order[:], sets.cell[:, :2] = 2, (100, 250)
-    state = Weighted(sets, np.zeros(SETS))
+    """Sets of two members after so many steps without any record."""
+    tracker, b = SetFilter(wide, SETS), np.zeros(wide.record_cells)
+    state = two(tracker, b, SETS)
     for step in range(steps):
         state = tracker.propagate(state, tracker.record(b, (1, step), records=records))
     w = np.exp(state.log_weight - state.log_weight.max())
@@ -456,10 +439,8 @@ def test_proposals_after_a_gap_change_no_result(wide, change):
     found = []
     for shares in ({}, {'walk_share': 0.0, 'birth_share': 0.0}):
         tracker = SetFilter(evolve(changed, **shares), 100_000)
-        sets = tracker.start(tracker.record(b, (0, 0))).sets
-        sets.order[:], sets.cell[:, :2], sets.sign[:] = 2, (100, 250), 1
         record = tracker.record(b, (1, 1), records=6)
-        step = tracker.weigh(tracker.propagate(Weighted(sets, np.zeros(100_000)), record), record)
+        step = tracker.weigh(tracker.propagate(two(tracker, b, 100_000), record), record)
         summary = tracker.summarise(step)
         found.append((step.log_evidence, summary.pmf, summary.sums[0, 90:115].sum()))
     assert found[0][0] == pytest.approx(found[1][0], abs=0.05)
@@ -526,7 +507,6 @@ def test_an_offset_drawn_anew_leaves_its_distribution(step):
             moved = moved.then(shift, place[:, k - 1] + d, place[:, k] + d)
         assert after.pull == pytest.approx(moved.pull)
         assert after.precision == pytest.approx(moved.precision)
-        held = path.draw(
-            shift, place[:, -1], (np.full(N, 0), np.full(N, step)), rng.random((N, 2))
-        )
-        assert set(np.unique(held[0])) <= {0, step}
+        few = np.full(N, 0), np.full(N, step)
+        held, _ = path.draw(shift, place[:, -1], few, rng.random((N, 2)))
+        assert set(np.unique(held)) <= {0, step}

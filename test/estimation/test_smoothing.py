@@ -10,16 +10,13 @@
 sequence of models."""
 
 import itertools
-from pathlib import Path
 
+from helpers.vector_files import load_vectors
 import numpy as np
-from oracles.smoothing import rts_smooth
 import pytest
 
 from sonar_imm.estimation import imm, kalman, smoothing
 from sonar_imm.estimation.smoothing import imm_smooth, IMMPredicted, smooth_modes
-
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'diver'
 
 
 def covariance(rng, *shape):
@@ -63,12 +60,21 @@ def imm_pass(transition, F, Q, B, H, R, x, P, mu, Z, moves_first=False):
     return tuple(np.array(part) for part in zip(*steps))
 
 
-# -- Rauch-Tung-Striebel --------------------------------------------------------------------------
+def rts_smooth(x, P, F, Q, B):
+    """The Rauch-Tung-Striebel smoother of a forward pass x (K, ..., n), P of one model."""
+    x, P = x.copy(), P.copy()
+    for k in range(len(x) - 2, -1, -1):
+        F1 = F[k + 1]
+        S = F1 @ P[k] @ np.swapaxes(F1, -1, -2) + Q[k + 1]
+        gain = P[k] @ np.swapaxes(F1, -1, -2) @ np.linalg.pinv(S, hermitian=True)
+        x[k] += kalman.apply(gain, x[k + 1] - kalman.apply(F1, x[k]) - B[k + 1])
+        P[k] += gain @ (P[k + 1] - S) @ np.swapaxes(gain, -1, -2)
+    return x, P
 
 
 def joint_by_covariance(F, Q, B, H, R, x0, P0, Z):
     """All states at once: the joint covariance, which may be singular, conditioned on all data."""
-    K, n, m = len(Z), len(x0), len(R)
+    K, n = len(Z), len(x0)
     mean, C = np.zeros((K, n)), np.zeros((K, n, K, n))
     mean[0], C[0, :, 0] = x0, P0
     for k in range(1, K):
@@ -80,51 +86,16 @@ def joint_by_covariance(F, Q, B, H, R, x0, P0, Z):
     gain = np.linalg.solve(big_H @ C @ big_H.T + np.kron(np.eye(K), R), big_H @ C).T
     after = C - gain @ big_H @ C
     x = mean.ravel() + gain @ (Z.ravel() - big_H @ mean.ravel())
-    assert Z.size == K * m
-    return x.reshape(K, n), np.array(
-        [after[k * n : (k + 1) * n, k * n : (k + 1) * n] for k in range(K)]
-    )
-
-
-@pytest.mark.parametrize('seed', range(4))
-def test_rts_equals_the_joint_gaussian(seed):
-    rng = np.random.default_rng(seed)
-    K, n = 8, 3
-    F, Q, B = rng.normal(size=(K, n, n)) * 0.7, covariance(rng, K, n), rng.normal(size=(K, n))
-    H, R, x0, P0, Z = (
-        rng.normal(size=(2, n)), covariance(rng, 2), rng.normal(size=n), covariance(rng, n),
-        rng.normal(size=(K, 2)),
-    )  # fmt: skip
-    x, P = rts_smooth(*kalman_pass(F, Q, B, H, R, x0, P0, Z), F, Q, B)
-    expected_x, expected_P = joint_by_covariance(F, Q, B, H, R, x0, P0, Z)
-    np.testing.assert_allclose(x, expected_x, rtol=1e-7, atol=1e-8)
-    np.testing.assert_allclose(P, expected_P, rtol=1e-7, atol=1e-8)
-
-
-@pytest.mark.parametrize('noise', [0.0, 0.04])
-def test_rts_with_a_velocity_without_memory_and_without_noise(noise):
-    """Rows of zeros in F, rows of zeros in Q: F P F' + Q is singular."""
-    K, rng = 7, np.random.default_rng(1)
-    F, Q = np.diag([1.0, 1.0, 0.0, 0.0]), np.diag([0.1, 0.2, noise, noise])
-    F[0, 2] = 0.3
-    B, H, R = np.array([0.4, 0.1, 0.4, 0.1]), np.eye(2, 4), np.diag([1.0, 2.0])
-    arguments = (
-        repeat(F, K), repeat(Q, K), repeat(B, K), H, R, np.zeros(4), np.eye(4),
-        rng.normal(size=(K, 2)),
-    )  # fmt: skip
-    x, P = rts_smooth(*kalman_pass(*arguments), repeat(F, K), repeat(Q, K), repeat(B, K))
-    expected_x, expected_P = joint_by_covariance(*arguments)
-    np.testing.assert_allclose(x, expected_x, atol=1e-9)
-    np.testing.assert_allclose(P, expected_P, atol=1e-9)
+    return x.reshape(K, n), np.einsum('kakb->kab', after.reshape(K, n, K, n))
 
 
 # -- IMM: exact cases -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('models, moves_at_all', [(1, True), (3, True), (3, False)])
-def test_models_that_are_all_the_same_give_rts_and_the_chain_alone(models, moves_at_all):
+def test_models_that_are_all_the_same_give_the_joint_gaussian_and_the_chain(models, moves_at_all):
     """The data say nothing about the model: smoothed probabilities are those of the chain. The
-    second number may be known exactly after each step."""
+    second number may be known exactly after each step: F P F' + Q is singular."""
     rng = np.random.default_rng(3)
     K, H, R = 9, np.array([[1.0, 0.0]]), np.eye(1)
     F, Q, B = rng.normal(size=(K, 2, 2)), covariance(rng, K, 2), rng.normal(size=(K, 2))
@@ -135,7 +106,11 @@ def test_models_that_are_all_the_same_give_rts_and_the_chain_alone(models, moves
     moves = [transition, *(np.repeat(part[:, None], models, axis=1) for part in (F, Q, B))]
     x0, P0 = np.zeros((models, 2)), repeat(np.eye(2), models)
     smoothed = imm_smooth(*imm_pass(*moves, H, R, x0, P0, mu0, Z), *moves)
-    x, P = rts_smooth(*kalman_pass(F, Q, B, H, R, x0[0], P0[0], Z), F, Q, B)
+    x, P = joint_by_covariance(F, Q, B, H, R, x0[0], P0[0], Z)
+    for part, due in zip(
+        rts_smooth(*kalman_pass(F, Q, B, H, R, x0[0], P0[0], Z), F, Q, B), (x, P)
+    ):
+        np.testing.assert_allclose(part, due, atol=1e-9)
     expected_mu = [mu0]
     for k in range(1, K):
         expected_mu.append(expected_mu[-1] @ transition[k])
@@ -174,11 +149,8 @@ def test_states_drawn_anew_give_the_forward_backward_algorithm():
 def test_a_model_nothing_leads_to_stays_finite():
     K, M = 5, 3
     transition = np.array([[0.7, 0.3, 0.0], [0.4, 0.6, 0.0], [0.0, 1.0, 0.0]])
-    F, Q, B = (
-        repeat(np.eye(2), M),
-        np.stack([np.eye(2), 2 * np.eye(2), np.eye(2)]),
-        np.zeros((M, 2)),
-    )
+    F, B = repeat(np.eye(2), M), np.zeros((M, 2))
+    Q = np.stack([np.eye(2), 2 * np.eye(2), np.eye(2)])
     moves = [repeat(part, K) for part in (transition, F, Q, B)]
     x0, P0, mu0 = np.zeros((M, 2)), repeat(np.eye(2), M), np.array([0.5, 0.5, 0.0])
     Z = np.random.default_rng(0).normal(size=(K, 2))
@@ -208,8 +180,7 @@ def test_nothing_to_smooth(K):
 
 
 def enumerate_sequences(F, Q, B, H, R, x, P, mu, transition, Z):
-    """Exact smoothed mean, covariance and model probabilities, and the exact filtered mean of the
-    last step."""
+    """Exact smoothed mean, covariance and model probabilities."""
     K, M = len(Z), len(mu)
     sequences = np.array(list(itertools.product(range(M), repeat=K)))
     log_weight, x, P, xs, Ps = (
@@ -229,13 +200,21 @@ def enumerate_sequences(F, Q, B, H, R, x, P, mu, transition, Z):
     steps = sequences.T
     sx, sP = rts_smooth(np.array(xs), np.array(Ps), F[steps], Q[steps], B[steps])
     mean = np.einsum('s,ksa->ka', weight, sx)
-    spread = sx - mean[:, None]
-    C = np.einsum('s,ksab->kab', weight, sP) + np.einsum('s,ksa,ksb->kab', weight, spread, spread)
-    return (
-        mean,
-        C,
-        np.stack([(weight[:, None] * (sequences == i)).sum(axis=0) for i in range(M)], axis=1),
-    )
+    off = sx - mean[:, None]
+    C = np.einsum('s,ksab->kab', weight, sP + off[..., :, None] * off[..., None, :])
+    return mean, C, np.stack([weight @ (sequences == i) for i in range(M)], axis=1)
+
+
+def draw(rng, F, Q, B, H, R, x0, P0, mu, transition, K):
+    """Measurements (K, m) of the jumping system."""
+    model = rng.choice(len(mu), p=mu)
+    x, Z = rng.multivariate_normal(x0[model], P0[model]), []
+    for k in range(K):
+        if k:
+            model = rng.choice(len(mu), p=transition[model])
+            x = rng.multivariate_normal(F[model] @ x + B[model], Q[model])
+        Z.append(rng.multivariate_normal(H @ x, R))
+    return np.array(Z)
 
 
 def random_models(rng, M):
@@ -272,14 +251,12 @@ def quiet_and_agile(rng, M):
 def test_the_enumeration_itself_agrees_with_an_independent_one(case):
     """At the last step smoothing is filtering, which the vectors of another prototype hold."""
     K = 5
-    with np.load(VECTORS / 'exact_mode_tree.npz') as vectors:
-        F, Q, B, transition, mu = (
-            vectors[f'cvct/{name}'] for name in ('F', 'Q', 'B', 'Pi', 'mu0')
-        )
-        x0, P0, Z, R, *expected = (
-            vectors[f'cvct/{case}/{name}']
-            for name in ('x0', 'P0', 'Z', 'R', 'exact_x', 'exact_P', 'exact_mu')
-        )
+    vectors = load_vectors('diver/exact_mode_tree')
+    F, Q, B, transition, mu = (vectors[f'cvct/{name}'] for name in ('F', 'Q', 'B', 'Pi', 'mu0'))
+    x0, P0, Z, R, *expected = (
+        vectors[f'cvct/{case}/{name}']
+        for name in ('x0', 'P0', 'Z', 'R', 'exact_x', 'exact_P', 'exact_mu')
+    )
     # The vectors move before they measure: a first measurement without information stands for
     # that.
     Z, R = np.vstack([np.zeros((1, 2)), Z[:K]]), np.concatenate([1e14 * np.eye(2)[None], R[:K]])
@@ -295,7 +272,7 @@ def enumerated(models, M, K, seed):
     n = F.shape[-1]
     mu, transition = rng.dirichlet(3 * np.ones(M)), chain(rng, M)
     x0, P0 = np.zeros((M, n)), repeat(np.eye(n), M)
-    Z = draw(rng, F, Q, B, H, R, x0, P0, mu, transition, K)[1]
+    Z = draw(rng, F, Q, B, H, R, x0, P0, mu, transition, K)
     exact = enumerate_sequences(F, Q, B, H, R, x0, P0, mu, transition, Z)
     moves = [repeat(part, K) for part in (transition, F, Q, B)]
     return moves, imm_pass(*moves, H, R, x0, P0, mu, Z), exact
@@ -389,23 +366,6 @@ def test_after_a_step_that_no_measurement_explains_the_filtered_states_count():
     end = imm_smooth(*(part[2:] for part in wide), *(part[2:] for part in moves))
     for one, other in zip(whole, end):
         np.testing.assert_allclose(one[2:], other, atol=1e-9)
-
-
-def draw(rng, F, Q, B, H, R, x0, P0, mu, transition, K):
-    """One truth (K, n) of the jumping system, its measurements (K, m) and models (K,)."""
-    model = rng.choice(len(mu), p=mu)
-    x, X, Z, J = rng.multivariate_normal(x0[model], P0[model]), [], [], []
-    for k in range(K):
-        if k:
-            model = rng.choice(len(mu), p=transition[model])
-            x = rng.multivariate_normal(F[model] @ x + B[model], Q[model])
-        X.append(x)
-        Z.append(rng.multivariate_normal(H @ x, R))
-        J.append(model)
-    return np.array(X), np.array(Z), np.array(J)
-
-
-# -- IMM: Monte Carlo -----------------------------------------------------------------------------
 
 
 # -- Kim's pass over model probabilities ----------------------------------------------------------

@@ -275,10 +275,12 @@ def test_a_frozen_value_of_fine_digits_is_no_fix_however_old():
         assert due or not any(passes(repeats, item) for item in frozen)
 
 
-@pytest.mark.parametrize('latitude, fine', [(80.0, True), (0.0, False)])
-def test_a_degree_of_longitude_is_short_in_the_north(latitude, fine):
+@pytest.mark.parametrize(
+    'latitude, std, fine', [(80.0, 0.9, True), (80.0, 0.5, False), (0.0, 0.9, False)]
+)
+def test_a_degree_of_longitude_is_short_in_the_north(latitude, std, fine):
     """Steps of 0.19 m are fine digits beside a deviation of 0.9 m, those of 1.1 m are coarse."""
-    repeats, degrees = RepeatFilter(5.0), {'latitude': latitude, 'covariance': 0.81 * np.eye(3)}
+    repeats, degrees = RepeatFilter(5.0), {'latitude': latitude, 'covariance': std**2 * np.eye(3)}
 
     def at(k, longitude):
         return GeodeticFix(stamp_ns=(1 + k) * SECOND, longitude=longitude, **degrees)

@@ -127,6 +127,7 @@ def test_a_twist_in_the_world_of_ned_is_turned_into_flu():
     'change, code',
     [
         ({'orientation': [0.0, 0.0, 0.0, 0.0]}, 'bad_orientation'),
+        ({'orientation': [0.0, 0.0, 0.0, 1.0105]}, 'bad_orientation'),
         ({'orientation': [0.0, 0.0, 0.0, 2.0]}, 'bad_orientation'),
         ({'orientation': [0.0, 1e300, 0.0, 1e300]}, 'bad_orientation'),
         ({'orientation': [0.0, np.nan, 0.0, 1.0]}, 'nan'),

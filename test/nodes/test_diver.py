@@ -32,6 +32,7 @@ from msg_adapters.scans import write_scan
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix, Fixes, GeodeticFix, RelativeFix, Start, VesselPose
+from sonar_imm.nodes.diagnostics import clock_offset
 from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.qos import lockstep_qos, output_qos
@@ -103,6 +104,18 @@ def test_a_message_that_the_tracker_cannot_use_is_known_as_such(rig):
             node.receive('fix', write_fix(fix, make))
     assert [stamp.used for stamp in node._meter.stamps['fix']] == [True, False] * 10
     assert {stamp.frame_id for stamp in node._meter.stamps['fix']} == {'map'}
+
+
+def test_two_clocks_are_told_apart_behind_a_full_queue(rig):
+    """What waits longer and longer in the node is as old as it was at its reception."""
+    node, now_ns = rig[1], time.time_ns()
+    for k in range(40):
+        received_ns = now_ns - k * 45_000_000  # the last one waited for 1.8 s
+        stamp_ns = received_ns - k % 2 * 3 * 10**9
+        fix = Fix(stamp_ns=stamp_ns, position=(1, 2, 0), covariance=np.eye(2), frame_id='map')
+        node.receive('fix', write_fix(fix, make), {'received_timestamp': received_ns})
+    ages = [stamp.age for stamp in node._meter.stamps['fix']]
+    assert clock_offset(ages) == pytest.approx(3.0, abs=0.3)
 
 
 @pytest.mark.usefixtures('quick')

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sonar_imm.estimation.arrays import FloatArray, IntArray
-from sonar_imm.estimation.set_model import SetModel, Sets
-from sonar_imm.estimation.set_proposals import begin, Beginning, Births, gains, propose_births
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.set_model import Sets
+from sonar_imm.estimation.set_proposals import begin, Births, gains, propose_births
 from sonar_imm.estimation.set_shifts import Jump, Shift, ShiftTables
 
 IMPOSSIBLE = -math.inf
@@ -37,16 +37,15 @@ class Proposals(NamedTuple):
     shared: Shift | Jump | None
 
 
-def propose(model: SetModel, b: FloatArray) -> Proposals:
-    """the tables for the record b (n,)."""
+def propose(model, b):
+    """The tables for the record b (n,)."""
     n, radius = model.record_cells, len(model.walk) // 2
     to = np.arange(n)[:, None] + np.arange(-radius, radius + 1)
     there = (to >= 0) & (to < n)
     gained, _ = gains(model, b, model.gram)
-    K = np.where(there, model.walk, 0.0)
     signs = len(model.signs)
     g = np.where(there, gained[:, np.clip(to, 0, n - 1)], -np.inf).reshape(signs * n, -1)
-    K = np.tile(K, (signs, 1))
+    K = np.tile(np.where(there, model.walk, 0.0), (signs, 1))
     best = g.max(axis=1, keepdims=True)
     data_driven = K * np.exp(g - best)
     q = model.walk_share * data_driven / data_driven.sum(axis=1, keepdims=True)
@@ -55,16 +54,12 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
         ratio = np.where(q > 0.0, K / q, 0.0)
     log_sum = (best[:, 0] + np.log(data_driven.sum(axis=1))).reshape(signs, n)
     births = propose_births(model, gained, model.birth_share, model.birth_cap)
-    walk = np.cumsum(q, axis=1)
     shared = model.shift or model.jump
-    return Proposals(walk, ratio, log_sum, births, model.walk_share, shared)
+    return Proposals(np.cumsum(q, axis=1), ratio, log_sum, births, model.walk_share, shared)
 
 
-def start(
-    model: SetModel, proposals: Proposals, b: FloatArray, uniform: FloatArray
-) -> tuple[Sets, FloatArray]:
-    """sets before the first record, drawn where it will want them, and the log
-    ratio (N,).
+def start(model, proposals, b, uniform):
+    """Sets before the first record, drawn where it will want them, and the log ratio (N,).
 
     uniform (N, 1 + J + K), or one more with a shift: how many members are elsewhere, one for each
     of them, the shift, and one for each of the K peaks, the last first.
@@ -102,9 +97,7 @@ def start(
     return sets, log_ratio
 
 
-def _peaks(
-    model: SetModel, births: Births, beginning: Beginning, drawn: FloatArray, offset: int
-) -> tuple[list[int], dict[int, int], float]:
+def _peaks(model, births, beginning, drawn, offset):
     """The members that a set begins with in the peaks of the record, by the random numbers drawn
     (K,), their signs, and the log ratio."""
     members, sign, paid = [], {}, 0.0
@@ -127,10 +120,8 @@ def _peaks(
     return members, sign, paid
 
 
-def propagate(
-    model: SetModel, proposals: Proposals, sets: Sets, uniform: FloatArray
-) -> tuple[Sets, FloatArray]:
-    """steps 1 to 5 of the model, the new sets and the log ratio (N,) of model to
+def propagate(model, proposals, sets, uniform):
+    """Steps 1 to 5 of the model, the new sets and the log ratio (N,) of model to
     proposal, -inf for impossible sets (whose members mean nothing)."""
     N, changes = len(uniform), model.most_changes
     cumulative = np.cumsum(model.transition, axis=1)
@@ -190,14 +181,7 @@ def propagate(
     return new, log_ratio
 
 
-def _birth(
-    model: SetModel,
-    births: Births,
-    places: list[int],
-    sign: dict[int, int],
-    uniform: float,
-    offset: int,
-) -> float:
+def _birth(model, births, places, sign, uniform, offset):
     """Insert one more place into ascending `places`, as far from them as it must be, and its sign
     into `sign`; the log ratio of the model's birth to this one, -inf when there is no room.
     offset: from cells of the lattice to those of the record."""
@@ -227,10 +211,10 @@ def _birth(
     raise AssertionError('a gap that has weight is always found')
 
 
-def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
-    """log likelihood (N,) of the record against that of an empty one, -inf where
-    an amplitude is not of its member's sign, and the amplitudes (N, J), their mean given the set,
-    in units of the noise."""
+def weigh(model, b, sets):
+    """Log likelihood (N,) of the record against that of an empty one, -inf where an amplitude is
+    not of its member's sign, and the amplitudes (N, J), their mean given the set, in units of the
+    noise."""
     log_likelihood = np.zeros(len(sets.order))
     amplitude = np.zeros(sets.cell.shape)
     for m in np.unique(sets.order[sets.order > 0]):
@@ -255,13 +239,10 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
     return log_likelihood, amplitude
 
 
-def propose_shared(
-    proposals: Proposals, before: int, cells: IntArray, negative: IntArray
-) -> tuple[FloatArray, FloatArray]:
+def propose_shared(proposals, before, cells, negative):
     """q (G,) and log of model to proposal (G,) for members at `cells` (k,), with
     `negative` (k,) 1 for negative ones; before: the shift of the record before plus pad."""
     shared, share, log_sum = proposals.shared, proposals.share, proposals.log_sum
-    assert shared
     if isinstance(shared, Jump):
         log_prior = shared.tables().log_prior
         log_sum = np.pad(log_sum, [(0, 0), (shared.pad, shared.pad)], constant_values=-np.inf)

@@ -6,113 +6,62 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Measurements some of which may be wild: the update over all inlier/outlier subsets.
+"""Numbers each of which may be wild: every inlier/outlier subset with its probability.
 
-A late echo is not a large error of a good measurement, it is another measurement. With a few
-numbers y_1 .. y_R at once, each good with probability 1 - eps and else spread with a flat density
-u, there are 2^R explanations, and all of them can be computed: a Gaussian each, weighted by its
-evidence, one Gaussian of the same mean and covariance at the end. A sequential gate picks one of
-these explanations, and which one depends on the order of the numbers.
-
-Explanations are grown number by number (`Explanation`), and those that fall `PRUNE` below the best
-are dropped. A number that is rejected costs ``eps u`` in every explanation: without that charge
-the explanation that rejects everything wins.
-
-This is the mathematics as it reads; `trackers.diver.explanations` is the same, for all
-hypotheses about a diver at once.
+A number that is rejected costs ``eps u`` in every explanation: without that charge the explanation
+that rejects everything wins. `trackers.diver.explanations` is the same, for all hypotheses about a
+diver at once.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
 import math
+from typing import NamedTuple
 
-from attrs import frozen
 import numpy as np
 
-from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.estimation.consider import consider_update
 
-PRUNE = 14.0
-"""An explanation whose log-probability is this much below the best one's is dropped."""
 
-Observation = tuple[Callable[[FloatArray], tuple[float, FloatArray]], float, float]
-"""A number: what gives h(x) and its gradient (n,) at a state, the value, its variance."""
-
-
-@frozen(eq=False)
-class Explanation:
-    """Which numbers (R,) are good, the state given that, and the log of its joint probability."""
-
-    good: tuple[bool, ...]
-    x: FloatArray
-    P: FloatArray
-    log_weight: float
-
-
-@frozen(eq=False)
-class SubsetUpdate:
-    """The explanations left, best known by `probability` (B,); x (n,) and P (n, n) of all of them
+class SubsetUpdate(NamedTuple):
+    """Subsets (B, R) of good numbers, their probability (B,); x (n,) and P (n, n) of all of them
     together; log_evidence of all the numbers; good (R,): probability that each is no outlier."""
 
-    explanations: Sequence[Explanation]
-    probability: FloatArray
-    x: FloatArray
-    P: FloatArray
+    subsets: np.ndarray
+    probability: np.ndarray
+    x: np.ndarray
+    P: np.ndarray
     log_evidence: float
-    good: FloatArray
+    good: np.ndarray
 
 
-def subset_update(
-    x: FloatArray,
-    P: FloatArray,
-    observations: Sequence[Observation],
-    *,
-    outlier_probability: float,
-    outlier_density: float,
-    estimated: BoolArray | None = None,
-    prune: float = PRUNE,
-) -> SubsetUpdate:
-    """Update x (n,), P (n, n) with numbers each of which may be wild.
+def subset_update(x, P, numbers, outlier_probability, outlier_density, estimated=None, prune=14.0):
+    """Update x (n,), P (n, n) with numbers: h(x) and its gradient, the value, its variance.
 
     A number is linearised where the explanation so far stands. outlier_density is per unit of the
-    numbers; estimated (n,): see `consider.consider_update`, None for all.
+    numbers; estimated (n,): see `consider.consider_update`, None for all. Subsets whose log
+    probability is `prune` below the best one's are dropped.
     """
     mask = np.ones(len(x), bool) if estimated is None else estimated
-    log_bad = _log(outlier_probability) + math.log(outlier_density)
+    log_bad = math.log(outlier_probability) + math.log(outlier_density)
     log_good = math.log1p(-outlier_probability)
-    left = [Explanation((), np.array(x, np.float64), np.array(P, np.float64), 0.0)]
-    for measure, value, variance in observations:
+    left = [((), x, P, 0.0)]
+    for measure, value, variance in numbers:
         grown = []
-        for old in left:
-            expected, gradient = measure(old.x)
-            S = float(gradient @ old.P @ gradient) + variance
+        for good, x, P, log in left:
+            expected, gradient = measure(x)
+            S = float(gradient @ P @ gradient) + variance
             innovation = value - expected
             fit = -0.5 * (innovation**2 / S + math.log(2.0 * math.pi * S))
             row, noise = gradient[None], np.array([[variance]])
-            x_b, P_b = consider_update(old.x, old.P, row, noise, np.array([innovation]), mask)
-            grown.append(Explanation((*old.good, False), old.x, old.P, old.log_weight + log_bad))
-            grown.append(Explanation((*old.good, True), x_b, P_b, old.log_weight + log_good + fit))
-        best = max(new.log_weight for new in grown)
-        left = [new for new in grown if new.log_weight >= best - prune]
-    return _together(left, len(observations))
-
-
-def _together(left: Sequence[Explanation], count: int) -> SubsetUpdate:
-    weight = np.array([each.log_weight for each in left])
-    best = float(weight.max())
-    share = np.exp(weight - best)
+            after = consider_update(x, P, row, noise, np.array([innovation]), mask)
+            grown.append(((*good, False), x, P, log + log_bad))
+            grown.append(((*good, True), *after, log + log_good + fit))
+        best = max(log for *_, log in grown)
+        left = [each for each in grown if each[3] >= best - prune]
+    subsets, states, covariances, log = (np.array(part) for part in zip(*left))
+    share = np.exp(log - log.max())
     probability = share / share.sum()
-    states = np.stack([each.x for each in left])
     x = probability @ states
-    spread = states - x
-    P = np.einsum('b,bij->ij', probability, np.stack([each.P for each in left]))
-    P = P + np.einsum('b,bi,bj->ij', probability, spread, spread)
-    good = np.array([each.good for each in left], np.float64).reshape(len(left), count)
-    return SubsetUpdate(
-        left, probability, x, P, best + math.log(float(share.sum())), probability @ good
-    )
-
-
-def _log(value: float) -> float:
-    return math.log(value) if value > 0.0 else -math.inf
+    P = np.einsum('b,bij->ij', probability, covariances)
+    P += np.einsum('b,bi,bj->ij', probability, states - x, states - x)
+    evidence = log.max() + math.log(share.sum())
+    return SubsetUpdate(subsets, probability, x, P, evidence, probability @ subsets)

@@ -7,6 +7,8 @@
 # language governing permissions and limitations under the License.
 
 from collections import Counter
+import os
+from pathlib import Path
 import struct
 import subprocess
 import sys
@@ -23,6 +25,7 @@ from sonar_imm_tools.recordings import mcap_records
 from sonar_imm_tools.recordings.mcap_records import McapScan, zstd
 from sonar_imm_tools.recordings.messages import ros_message, typestore
 from sonar_imm_tools.recordings.reader import BagError, BagReader
+from sonar_imm_tools.recordings.sources import RosbagsSource
 
 TEXT = 'std_msgs/msg/String'
 
@@ -63,6 +66,16 @@ def test_a_scan_of_a_whole_file_equals_the_indexed_reading(recording):
     assert not scan.lost and scan.counts == Counter({1: 26, 2: 14})
     assert {channel.topic for channel in scan.channels.values()} == {'/a', '/b'}
     scan.close()
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='asks Linux for open files')
+def test_a_bag_without_chunks_is_read_by_scan_and_closed(recording, monkeypatch):
+    file, expected = recording
+    monkeypatch.setattr(RosbagsSource, 'unordered', True)
+    with BagReader(file.parent) as bag:
+        found = [(item.log_ns, item.raw) for item in bag.messages()]
+    assert found == sorted(expected, key=lambda item: item[0])
+    assert str(file) not in map(os.path.realpath, Path('/proc/self/fd').iterdir())
 
 
 def test_a_cut_keeps_whole_messages_of_the_last_chunk(recording, tmp_path):

@@ -10,6 +10,7 @@
 
 from contextlib import ExitStack
 import threading
+from types import SimpleNamespace
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from helpers.fix_bags import COUNT, Ear, write_fixes
@@ -25,7 +26,7 @@ from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.replay import lockstep as lockstep_module
 from sonar_imm_tools.replay.harness import START_LIMIT
 from sonar_imm_tools.replay.link import Link, LinkError
-from sonar_imm_tools.replay.lockstep import Counts, LockStep, Recorder
+from sonar_imm_tools.replay.lockstep import Chain, Counts, LockStep, Recorder
 from sonar_imm_tools.replay.player import play, Player, PlayOptions
 
 
@@ -230,3 +231,9 @@ def test_recorded_estimates_read_back(link, start, stepping):
     estimate = recorder.estimates()[0]
     assert estimate.frame_id == 'map'
     assert estimate.model_names == ('slow', 'fast')
+
+
+def test_of_two_nodes_each_message_counts_once():
+    """Seven of the second one's nine messages came from the first; the player sent twelve."""
+    first, second = (SimpleNamespace(counts=Counts(*each)) for each in ((10, 1, 7), (9, 2, 6)))
+    assert Chain(first, second, ()).counts == (12, 3, 6)

@@ -85,21 +85,20 @@ def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[st
     origin = float(lines[0].longitude[0]), float(lines[0].latitude[0])
     tracks = [_plane(line, origin) for line in lines]
     crossings = []
-    for i, j, s, t, angle in _meetings(*tracks):
+    for i, j, s, t, directions in _meetings(*tracks):
         found = [
             _horizons(line, track, row + share, position_std)
             for line, track, row, share in zip(lines, tracks, (i, j), (s, t))
         ]
         limit = max(line.separation for line in lines)
-        directions = np.array([track[row + 1] - track[row] for track, row in zip(tracks, (i, j))])
-        directions /= np.hypot(*directions.T)[:, None]
+        sine, cosine = np.linalg.det(directions), directions[0] @ directions[1]
         crossings.append(
             {
                 'stamp_a_ns': lines[0].records[i].stamp_ns,
                 'stamp_b_ns': lines[1].records[j].stamp_ns,
                 'longitude': _between(lines[0].longitude, i, s),
                 'latitude': _between(lines[0].latitude, i, s),
-                'angle_deg': angle,
+                'angle_deg': float(np.degrees(np.arctan2(abs(sine), abs(cosine)))),
                 **compared(found[0], found[1], limit, directions, position_std),
             }
         )
@@ -264,9 +263,9 @@ def _plane(line: Line, origin: tuple[float, float]) -> FloatArray:
     return np.column_stack([east, np.radians(line.latitude - origin[1]) * EARTH_RADIUS])
 
 
-def _meetings(a: FloatArray, b: FloatArray) -> list[tuple[int, int, float, float, float]]:
+def _meetings(a: FloatArray, b: FloatArray) -> list[tuple[int, int, float, float, FloatArray]]:
     """Where the polygons a (T, 2) and b (U, 2) cross: segment of each, the share of it that is
-    passed, and the angle between them in degrees."""
+    passed, and their directions (2, 2), unit vectors."""
     found = []
     u, v = np.diff(a, axis=0), np.diff(b, axis=0)
     for i in range(len(u)):
@@ -277,8 +276,9 @@ def _meetings(a: FloatArray, b: FloatArray) -> list[tuple[int, int, float, float
             t = (apart[:, 0] * u[i, 1] - apart[:, 1] * u[i, 0]) / across
         # Half-open, so that a crossing at a position counts once.
         for j in np.flatnonzero((s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0)):
-            angle = np.degrees(np.arctan2(abs(across[j]), abs(float(u[i] @ v[j]))))
-            found.append((i, int(j), float(s[j]), float(t[j]), float(angle)))
+            directions = np.array([u[i], v[j]])
+            directions /= np.hypot(*directions.T)[:, None]
+            found.append((i, int(j), float(s[j]), float(t[j]), directions))
     return found
 
 

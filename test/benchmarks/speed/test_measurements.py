@@ -6,10 +6,11 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What is measured beside a peer is the same sums, and every variant is measured."""
+"""What is measured beside a peer is the same sums."""
 
 import pytest
 
+from benchmarks import speed
 from benchmarks.speed import bathymetry, diver, fathometer, obstacle
 
 
@@ -18,7 +19,6 @@ def short(monkeypatch):
     ping = bathymetry.a_ping(last_range=27.0)
     monkeypatch.setattr(bathymetry, 'a_ping', lambda **values: ping)
     monkeypatch.setattr(bathymetry, 'PEER_BINS', 60)
-    monkeypatch.setattr(fathometer, 'PARTICLES', 500)
     return ping
 
 
@@ -36,17 +36,9 @@ def test_the_best_round_of_each_method_counts(monkeypatch):
     def take(name):
         clock[0] += next(costs[name])
 
-    monkeypatch.setattr(bathymetry.time, 'perf_counter', lambda: clock[0])
+    monkeypatch.setattr(speed.time, 'perf_counter', lambda: clock[0])
     methods = {'a': (lambda: take('a'), 10), 'b': (lambda: take('b'), 4)}
     assert bathymetry.rates(methods, rounds=3) == {'a': 5.0, 'b': 0.5}
-
-
-def test_stone_soup_follows_the_same_floor(short):
-    pytest.importorskip('stonesoup')
-    height = bathymetry.stone_soup_filter(bathymetry.cut(short, 60))
-    assert abs(height[20:]).max() < 0.5
-    speeds = bathymetry.bench_stone_soup(rounds=1)['bins_per_second']
-    assert set(speeds) == {'particles', 'stone_soup'}
 
 
 def test_filterpy_does_the_same_sums_for_a_diver():
@@ -54,33 +46,19 @@ def test_filterpy_does_the_same_sums_for_a_diver():
     assert diver.bench_step(rounds=1, steps=8)['largest_difference_m'] < 1e-9
 
 
-def test_divers_are_tracked_in_each_measurement():
-    assert diver.bench_scan(targets=40, scans=3)['assigned'] > 0.9
+def test_a_scan_of_divers_is_timed_with_either_association():
     clutter = diver.bench_clutter(rounds=1, scans=15)
     assert clutter['fixes'] > 15 and min(clutter['gnn_cpu_ms'], clutter['jipda_cpu_ms']) > 0.0
 
 
-def test_the_short_likelihood_is_the_long_one(short):
-    result = fathometer.bench_likelihood(rounds=1, sets=5)
-    assert result['good'] and result['largest_relative_difference'] < 1e-6
-
-
-def test_every_step_from_pressure_to_response_is_timed():
-    result = fathometer.bench_array(rounds=1, snapshots=3, length=960, hydrophones=6)
-    assert len(result['ms']) == 6 and min(result['ms'].values()) > 0.0
-    assert 'mvdr' in fathometer.BENCHES[-1].sentence(result)
-
-
-def test_a_record_is_timed_with_all_its_reflectors(monkeypatch):
-    monkeypatch.setattr(fathometer, 'PARTICLES', 20_000)
+def test_a_record_is_timed_with_all_its_reflectors():
     record = fathometer.bench_record(2)
     assert set(record['reflectors'].values()) == {8}
     assert set(record['median_ms']) == set(record['reflectors'])
 
 
-@pytest.mark.parametrize('name', obstacle.VARIANTS)
-def test_each_variant_tracks_all_obstacles_and_every_ping_is_timed(name):
-    clutter, parameters = obstacle.VARIANTS[name]
-    result = obstacle.bench_ping(rounds=1, pings=16, obstacles=10, clutter=clutter, **parameters)
+@pytest.mark.parametrize('clutter', [0, 30])
+def test_all_obstacles_are_tracked_and_every_ping_is_timed(clutter):
+    result = obstacle.bench_ping(rounds=1, pings=16, obstacles=10, clutter=clutter)
     assert result['tracked'] >= 10 and result['pings'] == 6
     assert 0.0 < result['median_ms'] <= result['p99_ms']

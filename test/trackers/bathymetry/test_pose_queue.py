@@ -31,7 +31,7 @@ def ping(seconds, **changes):
 def pose(seconds):
     return Navigation(
         stamp_ns=round((START + seconds) * SECOND),
-        position=(float(seconds), 0.0, 0.0),
+        position=(float(seconds), (seconds % 100.0) ** 2, 0.0),
         orientation=(0.0, 0.0, 0.0, 1.0),
         frame_id='odom',
     )
@@ -58,6 +58,7 @@ def test_the_ship_is_where_it_was_when_each_bin_was_heard(queue):
     queue.add_ping(ping(39.5))
     first, last = (ping.posed for ping in queue.ready(CONFIG))
     assert first.poses.position[:, 0] == pytest.approx([10.0, 10.01, 10.5])
+    assert first.poses.position[:, 1] == pytest.approx([100.0, 100.21, 110.5])  # 21 m/s
     assert last.poses.position[:, 0] == pytest.approx([39.5, 39.51, 40.0])
     assert first.frame_id == 'odom' and not len(queue)
     queue.add_ping(ping(39.6))  # its last bin is heard after the last pose

@@ -65,6 +65,9 @@ def test_the_models_are_those_of_the_vectors():
     assert finer.walk == pytest.approx(made.walk * math.sqrt(0.4), rel=1e-12)
 
 
+STAY = np.array([kind.stay for kind in KINDS])
+
+
 @pytest.mark.parametrize('width', [0.001, 0.02, 0.05, 0.4, 5.0, 100.0])
 def test_the_chain_is_reversible_at_any_width(width):
     made = terrain_of(width)
@@ -72,6 +75,9 @@ def test_the_chain_is_reversible_at_any_width(width):
     assert made.transition.min() >= 0.0 and np.isfinite(made.phi).all()
     assert made.transition.sum(axis=1) == pytest.approx(1.0)
     assert flows == pytest.approx(flows.T, abs=1e-12)
+    # A model is left after its stay, and at most in every second bin.
+    left = 1.0 - np.diag(made.transition)
+    assert left == pytest.approx(np.minimum(width / STAY, 0.5), abs=1e-9)
 
 
 @pytest.mark.parametrize('staves', [2, 4, 7, 8])

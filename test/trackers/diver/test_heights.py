@@ -31,7 +31,7 @@ from sonar_imm.trackers.diver.scales import protected_rows
 from sonar_imm.trackers.diver.scan import ping_measurements, Scan
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverTracker
-from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
+from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate
 
 CV = {
     'model_set': 'linear', 'association': 'gnn', 'max_tracks': 1, 'dimensions': 3,
@@ -356,6 +356,25 @@ def errors(estimates, places, settled):
         error = estimate.state[0, :3] - places[estimate.stamp_ns][:3]
         rows.append([error[2], error @ np.linalg.solve(estimate.covariance[0, :3, :3], error)])
     return np.array(rows)
+
+
+@pytest.mark.parametrize(
+    'settings, two',
+    [
+        ({'dimensions': 3}, True),
+        ({'dimensions': 3, 'depth_min': 4.0, 'depth_max': 4.0}, None),
+        ({'dimensions': 2}, None),
+    ],
+)
+def test_paths_alone_tell_no_depth_above_from_one_below_the_receivers(settings, two):
+    rx, place = RECEIVERS - [0.0, 0.0, 10.0], np.array([30.0, 40.0, -4.0])
+    path = np.linalg.norm(rx - place, axis=1) + np.linalg.norm(rx[0] - place)
+    tracker = DiverTracker(DiverConfig(max_tracks=1, **settings))
+    for second in range(1, 9):
+        ping = arrivals(second * 10**9, rx, path / 1500.0, tx=rx[0])
+        (estimate,) = tracker.process(ping)
+    said = estimate.extras.get('depth_ambiguous')
+    assert (said is None) if two is None else said.tolist() == [two]
 
 
 def test_depth_hypotheses_neither_exchange_weight_nor_borrow():

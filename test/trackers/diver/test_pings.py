@@ -350,6 +350,19 @@ def test_what_very_many_receivers_hear_is_one_diver(tag, count):
     np.testing.assert_allclose(estimate.state[0, :2], place[:2], atol=0.05)
 
 
+def test_a_ping_that_no_track_takes_starts_one():
+    """Two tags without a number, by turns; the second one begins when the first is known."""
+    places = np.array([[40.0, 30.0, 0.0], [-60.0, -50.0, 0.0]])
+    turn = np.radians(45.0) * np.arange(8)
+    rx = np.column_stack([90.0 * np.cos(turn), 70.0 * np.sin(turn), np.zeros(8)])
+    tracker = DiverTracker(DiverConfig())
+    for second, tag in enumerate([0] * 6 + [1, 0] * 3, start=1):
+        toa = np.linalg.norm(rx - places[tag], axis=1) / 1500.0
+        (estimate,) = tracker.process(ping(rx, toa, second * SECOND))
+        assert len(estimate) == 1 + (second > 6)
+    np.testing.assert_allclose(estimate.state[:, :2], places[:, :2], atol=0.1)
+
+
 def in_line(rng):
     """A line array, and a target on its line or a hair beside it."""
     n = rng.integers(2, 8)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from sonar_imm.trackers.fathometer import multiples
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.multiples import Multiples, RECORDS, Seen, ways_above
 
@@ -92,6 +93,16 @@ def test_all_ways_share_one_prior():
     ways = [len(ways_above(np.ones(d.shape[1]), d.shape[1] - 1).sign) for d in (few, many)]
     assert ways == [1, 10]
     assert odds(few) / odds(many) == pytest.approx(10.0, rel=0.05)
+
+
+def test_of_very_many_ways_the_nearest_count(monkeypatch):
+    """Here both reflectors together alone, and not twice either, which ends 0.05 m beside it."""
+    odds = []
+    for most in (multiples.MOST_WAYS, 1):
+        monkeypatch.setattr(multiples, 'MOST_WAYS', most)
+        p = after(np.array([[9.0, 9.05, 18.05]]), FathometerConfig())[-1]
+        odds.append(p / (1.0 - p))
+    assert 2.0 < odds[0] / odds[1] < 3.0
 
 
 def test_the_sign_counts_where_there_are_two():

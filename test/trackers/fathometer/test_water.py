@@ -9,11 +9,12 @@
 """The floor of profiler lines in the tracker: labels, depth, the transmit pulse, and sentences."""
 
 from attrs import evolve
+from helpers.profiler_lines import halves, line, LINES, tracked
 from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
-from benchmarks.fathometer_field import halves, line, LINES, real_lines, tracked
+from benchmarks.fathometer_field import real_lines
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.tracker import FathometerTracker

@@ -75,6 +75,13 @@ def test_pulse_of_the_band_is_left_alone():
     assert not EchoWidth().take(next(made(0.03)), config, band)
 
 
+def test_pulse_is_judged_anew_until_many_traces_have_shown_it():
+    found, config, band = EchoWidth(), FathometerConfig(), band_pulse(50.0, 4000.0, 1500.0)
+    widths = np.repeat([0.3, 0.5, 0.8, 1.3, 2.0], [1, 4, 10, 45, 20])
+    taken = [found.take(next(made(width)), config, band) for width in widths]
+    assert (np.flatnonzero(taken) + 1).tolist() == [1, 5, 15, 60]
+
+
 def test_room_for_all_reflectors_is_left():
     found, config = EchoWidth(), FathometerConfig(order_max=12)
     assert found.take(next(made(2.0)), config, band_pulse(50.0, 4000.0, 1500.0))
