@@ -25,7 +25,7 @@ from sonar_imm_tools.survey.adjustment import (
     robust_rms,
 )
 from sonar_imm_tools.survey.line import BASIS
-from sonar_imm_tools.survey.looks import joined, Looks, looks_of, strips
+from sonar_imm_tools.survey.looks import Looks, looks_of, strips
 
 BUDGET = budget()
 
@@ -63,7 +63,8 @@ def small(seed=1, lines=3, cells=60):
 def dense(made, priors):
     """Partials (m, P), heights (m,), variances and blocks of ten seconds, and the incidence of
     cells, written down row by row."""
-    looks = joined(made)
+    looks = Looks.joined(made)
+    looks = looks.chosen(np.lexsort((looks.side, looks.line, looks.iy, looks.ix)))
     L, m = len(made), len(looks)
     J = np.zeros((m, 3 + 3 * L))
     for row in range(m):

@@ -19,7 +19,7 @@ from sonar_imm.trackers.navigation import MOST_WAITING
 
 SECOND = 10**9
 START = 10**6
-CONFIG = BathymetryConfig(sound_speed=1500.0, max_gap=2.0, max_extrapolation=0.0)
+CONFIG = BathymetryConfig(sound_speed=1500.0, max_gap=2.0)
 
 
 def ping(seconds, **changes):
