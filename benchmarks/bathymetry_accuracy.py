@@ -11,9 +11,8 @@
     python -m benchmarks.bathymetry_accuracy --out docs/results/bathymetry_accuracy.json
 
 A flat floor 15 m below an array of eight staves, with a white rough patch of 0.5 m; 30 to 10 dB.
-Prints RMSE of the height over smooth floor, patch and all, RMSE of the angle, intersection over
-union of the patch with the bins labelled rough, and the share of true heights within two standard
-deviations.
+Prints RMSE of the height over smooth floor, patch and all, intersection over union of the patch
+with the bins labelled rough, and the share of true heights within two standard deviations.
 """
 
 from __future__ import annotations
@@ -53,18 +52,17 @@ CLASSICAL = ('phase difference of one pair', 'music', 'capon')
 
 
 class Answer(NamedTuple):
-    """Height and angle of every bin of every ping (pings, T); rough: labels; inside: the truth
-    lies within two standard deviations. None for methods that do not say."""
+    """Height of every bin of every ping (pings, T); rough: labels; inside: the truth lies within
+    two standard deviations. None for methods that do not say."""
 
     height: np.ndarray
-    angle: np.ndarray
     rough: np.ndarray | None
     inside: np.ndarray | None
 
 
 def classical(name: str, scene: Scene, config: BathymetryScenario) -> Answer:
     """Directions from windows of +-5 bins, without a tracker."""
-    heights, angles = [], []
+    heights = []
     tilt, spacing = math.radians(config.tilt_deg), config.spacing_wavelengths
     largest = array.largest_sine(spacing)
     grid = np.linspace(-largest, largest, 257)
@@ -77,8 +75,7 @@ def classical(name: str, scene: Scene, config: BathymetryScenario) -> Answer:
         angle = np.arcsin(np.clip(sine, -1.0, 1.0))
         depth = array.depth_of_angle(angle, item.measurement.range, tilt)
         heights.append(config.sonar_height - depth)
-        angles.append(angle)
-    return Answer(np.array(heights), np.array(angles), None, None)
+    return Answer(np.array(heights), None, None)
 
 
 def tracked(values: Mapping[str, Any], scene: Scene, printed: bool) -> Answer:
@@ -86,7 +83,6 @@ def tracked(values: Mapping[str, Any], scene: Scene, printed: bool) -> Answer:
     tracker = PrintedTracker(config) if printed else BathymetryTracker(config)
     tables = [tracker.process(item.measurement)[0].columns() for item in scene.measurements]
     height = np.array([table['height'] for table in tables])
-    angle = np.array([table['angle'] for table in tables])
     truth = np.array([profile.height for profile in truths(scene, TrueProfile)])
     inside = rough = None
     if 'cov_height_height' in tables[0]:
@@ -98,20 +94,18 @@ def tracked(values: Mapping[str, Any], scene: Scene, printed: bool) -> Answer:
     elif len(names) > 1 and 'initial_probabilities' not in values:
         of_rough = ['prob_rw'] if 'prob_rw' in names else names[len(names) // 2 :]
         rough = np.array([sum(table[key] for key in of_rough) > 0.5 for table in tables])
-    return Answer(height, angle, rough, inside)
+    return Answer(height, rough, inside)
 
 
 def score(answer: Answer, scene: Scene) -> dict[str, Any]:
     truth = truths(scene, TrueProfile)
     patch = np.array([profile.patch for profile in truth])
     square = np.square(answer.height - np.array([profile.height for profile in truth]))
-    angular = np.square(answer.angle - np.array([profile.angle for profile in truth]))
     rough, inside = answer.rough, answer.inside
     return {
         'smooth': math.sqrt(square[~patch].mean()),
         'patch': math.sqrt(square[patch].mean()),
         'all': math.sqrt(square.mean()),
-        'angle_deg': math.degrees(math.sqrt(np.nanmean(angular))),
         'iou': None if rough is None else float((rough & patch).sum() / (rough | patch).sum()),
         'inside_smooth': None if inside is None else float(inside[~patch].mean()),
         'inside_patch': None if inside is None else float(inside[patch].mean()),

@@ -16,8 +16,7 @@ patch (m), the share of heights within two standard deviations, the same inside 
 overlap of the patch with the bins called rough, or, without a patch, the share of bins called
 rough; of `terrain` both also with `winding` floor counted as rough (`_either`), which roughness
 correlated over metres is as well, and the share of the patch and of the rest that is told smooth
-(`told_smooth_patch`, `told_smooth`). `worst`: the smallest share within two standard deviations of
-a single ping. `microseconds`: CPU time of a bin, all methods in turn on each ping. `calibration`:
+(`told_smooth_patch`, `told_smooth`). `calibration`:
 of `terrain`, the bins of all floors by their probability of rough floor, the mean of it and the
 share that is rough.
 
@@ -30,7 +29,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import math
-import time
 from typing import Any
 
 from attrs import evolve, frozen
@@ -206,14 +204,6 @@ class Scores:
 
     def __init__(self) -> None:
         self.pings: list[dict[str, Any]] = []
-        self.seconds, self.bins = 0.0, 0
-
-    def add(self, config: BathymetryConfig, snapshot: Snapshot, truth: TrueProfile) -> None:
-        begin = time.process_time()
-        estimate = track_ping(Ping(config, snapshot, None)).estimate
-        self.seconds += time.process_time() - begin
-        self.bins += len(snapshot)
-        self.score(estimate, truth)
 
     def score(self, estimate: Estimate, truth: TrueProfile) -> None:
         table = estimate.columns()
@@ -242,7 +232,6 @@ class Scores:
         return {
             'rmse': float(np.sqrt(np.mean(np.square(error)))),
             'inside': float(inside.mean()),
-            'worst': float(min(ping['inside'].mean() for ping in self.pings)),
             'rmse_patch': float(np.sqrt(np.mean(np.square(error[patch])))) if there else None,
             'inside_patch': float(inside[patch].mean()) if there else None,
             'overlap': float((rough & patch).sum() / (rough | patch).sum()) if there else None,
@@ -253,7 +242,6 @@ class Scores:
             'called_either': None if there else float(either.mean()),
             'told_smooth': float(smooth[~patch].mean()),
             'told_smooth_patch': float(smooth[patch].mean()) if there else None,
-            'microseconds': 1e6 * self.seconds / self.bins,
         }
 
 
@@ -308,15 +296,13 @@ def main(pings: int = 10, seed: int = 1, array_seeds: int = 5) -> Parts:
     yield {'pings': pings, 'seed': seed}
     yield from arrays(max(pings // 2, 5), 1000 + seed, array_seeds)
     methods = {name: BathymetryConfig(**EXACT_ARRAY, **values) for name, values in METHODS.items()}
-    for config in methods.values():
-        BathymetryTracker(config).warm()
     of_terrain = []
     for number, (name, floor) in enumerate(FLOORS.items()):
         found = {method: Scores() for method in methods}
         for ping in range(pings):
             snapshot, truth = heard(floor, 100_000 * seed + 1000 * number + ping)
             for method, config in methods.items():
-                found[method].add(config, snapshot, truth)
+                found[method].score(track_ping(Ping(config, snapshot, None)).estimate, truth)
         of_terrain.append(found['terrain'])
         yield {'floors': {name: {method: scores.row() for method, scores in found.items()}}}
     yield {'calibration': calibration(of_terrain)}

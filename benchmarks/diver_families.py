@@ -21,13 +21,11 @@ of the position, 2 is due; fixes before the tenth do not count.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-import json
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.recordings import DATA
+from benchmarks.recordings import autoferry, DATA
 from benchmarks.study import final_estimates, first_track, Parts, rms, study
 from sonar_imm.measurements import Fix
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
@@ -189,9 +187,10 @@ def recorded(seed: int = 0) -> dict[str, Path]:
     dvl = np.genfromtxt(DATA / 'stpere_nav/dvl.csv', delimiter=',', names=True)
     turned = np.genfromtxt(DATA / 'stpere_nav/attitude.csv', delimiter=',', names=True)
     courses = {'AUV, recorded, .3 m': (*_reckoned(dvl, turned), 0.3)}
-    truth = json.loads((DATA / 'autoferry/scenario13_groundTruth.json').read_text())
-    for number, (t, place) in enumerate(_boats(truth), start=1):
-        courses[f'boat {number}, recorded, 1 m'] = t, place, 1.0
+    _, truth = autoferry('radar')
+    for number in (1, 2):
+        own = truth[truth[:, 1] == number]
+        courses[f'boat {number}, recorded, 1 m'] = own[:, 0], own[:, 2:], 1.0
     for name, (t, place, std) in courses.items():
         grid = np.arange(t[0], min(t[-1], t[0] + 400.0), 1.0)
         there = np.column_stack([np.interp(grid, t, column) for column in place.T])
@@ -213,19 +212,6 @@ def _reckoned(dvl: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarr
     east = np.convolve(forward * np.sin(yaw) + right * np.cos(yaw), smooth, 'same')
     step = np.diff(t, prepend=t[0])
     return t, np.column_stack([np.cumsum(east * step), np.cumsum(north * step)])
-
-
-def _boats(rows: Sequence[Any]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Time and place (east, north) of each boat of the Autoferry recording."""
-    rows = [row for scan in rows for row in scan]
-    boats = []
-    for number in sorted({row['targetID'] for row in rows}):
-        own = sorted(
-            (row['time'], *row['position'][:2]) for row in rows if row['targetID'] == number
-        )
-        table = np.array(own)
-        boats.append((table[:, 0], np.ascontiguousarray(table[:, [2, 1]])))
-    return boats
 
 
 def paths(seeds: int) -> dict[str, Path]:

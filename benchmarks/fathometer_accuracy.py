@@ -14,8 +14,7 @@ Each run is one drift as cross-spectra (seven to nine reflectors over 300 record
 hydrophones of the paper; a quarter of the snapshot with four times as many, which says as much and
 is made four times as fast), processed twice (MVDR and conventional) and tracked by every
 configuration. OSPA has a cutoff of 2 m and order 2; a reflector within 0.4 m of a true one is
-neither false nor missed. Birth delay: records from the presence of a new reflector to the first of
-three records in a row that have it.
+neither false nor missed.
 """
 
 from __future__ import annotations
@@ -36,6 +35,7 @@ from benchmarks.fathometer_paper import (
 )
 from benchmarks.study import final_estimates, mean_of, Parts, standard_error, study
 from sonar_imm.acoustics.fathometer import coherence, depth_response, noise_sigma, steering
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import CrossSpectra, Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.simulation.fathometer.scenario import drift_of
@@ -62,10 +62,6 @@ CONFIGURATIONS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     ),
 }
 """The trace, parameters, and what of `SetModel` is changed."""
-
-
-Truth = list[tuple[np.ndarray, np.ndarray]]
-"""The ids and the depths of the reflectors of each record."""
 
 
 def responses(spectra: CrossSpectra) -> dict[str, Trace]:
@@ -96,8 +92,8 @@ def responses(spectra: CrossSpectra) -> dict[str, Trace]:
     return made
 
 
-def drift(seed: int, records: int) -> tuple[dict[str, list[Trace]], Truth]:
-    """Traces of one run by processor, and the true depths and ids of each record."""
+def drift(seed: int, records: int) -> tuple[dict[str, list[Trace]], list[FloatArray]]:
+    """Traces of one run by processor, and the true depths of each record."""
     scale = records / 300
     config = FathometerScenario(
         records=records,
@@ -115,43 +111,23 @@ def drift(seed: int, records: int) -> tuple[dict[str, list[Trace]], Truth]:
         spectra = cross_spectra(config, floor, record, floor.array_depth_stated[record], rng)
         for name, trace in responses(spectra).items():
             traces.setdefault(name, []).append(trace)
-        here = floor.present[record]
-        truth.append((np.flatnonzero(here), floor.depth[record, here]))
+        truth.append(floor.depth[record, floor.present[record]])
     return traces, truth
 
 
-def score(tracker: FathometerTracker, traces: list[Trace], truth: Truth) -> dict[str, float]:
+def score(
+    tracker: FathometerTracker, traces: list[Trace], truth: list[FloatArray]
+) -> dict[str, float]:
     found = final_estimates(tracker, traces)
-    rows: dict[str, list[float]] = {}
-    seen_by_id: dict[int, list[tuple[int, bool]]] = {}
-    for k, (trace, (ids, depth)) in enumerate(zip(traces, truth)):
+    rows = []
+    for trace, depth in zip(traces, truth):
         estimate = found[trace.stamp_ns]
         right, apart = fathometer_paper.score(estimate, depth)
-        distance = np.abs(reflectors(estimate)[:, :1] - depth)
-        hit = (distance < NEAR).any(axis=0)
-        values = {
-            'P(order right)': right,
-            'OSPA': apart,
-            'false': float(np.count_nonzero(~(distance < NEAR).any(axis=1))),
-            'missed': float(np.count_nonzero(~hit)),
-        }
-        for name, value in values.items():
-            rows.setdefault(name, []).append(value)
-        for number, there in zip(ids, hit):
-            seen_by_id.setdefault(int(number), []).append((k, bool(there)))
-    result = {name: float(np.mean(values)) for name, values in rows.items()}
-    born = [history for history in seen_by_id.values() if history[0][0] > 5]
-    result['birth delay'] = float(np.mean([_delay(history) for history in born])) if born else 0.0
-    return result
-
-
-def _delay(history: list[tuple[int, bool]]) -> int:
-    """Records until a reflector is there for three in a row; all it has when it never is."""
-    there = [seen for _, seen in history]
-    for k in range(len(there) - 2):
-        if all(there[k : k + 3]):
-            return k
-    return len(there)
+        near = np.abs(reflectors(estimate)[:, :1] - depth) < NEAR
+        false, missed = ~near.any(axis=1), ~near.any(axis=0)
+        rows.append((right, apart, false.sum(), missed.sum()))
+    names = 'P(order right)', 'OSPA', 'false', 'missed'
+    return dict(zip(names, np.mean(rows, axis=0).tolist()))
 
 
 def main(

@@ -17,8 +17,7 @@ model over each whole record, in whole numbers of 2.5 steps to a standard deviat
 so; cross-spectra are drawn from the same model frequency by frequency, of as many snapshots as fit
 into the record side by side, which gives a response of the same noise. Every row has the same
 floors. Rows are written as runs end. P is the share
-of records whose number of reflectors is right, OSPA of second order with a cutoff of 2 m; SNR the
-median amplitude of each layer in units of the noise.
+of records whose number of reflectors is right, OSPA of second order with a cutoff of 2 m.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
-from benchmarks.fathometer_paper import reflectors, score
+from benchmarks.fathometer_paper import score
 from benchmarks.study import Parts, standard_error, study
 from sonar_imm.trackers.fathometer.pressure import automatic_snapshot
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
@@ -94,7 +93,7 @@ def run(
         # Drawn frequency by frequency, their noise does not fade.
         settings = [evolve(each, window='rectangular', overlap=0.0) for each in settings]
     trackers = [FathometerTracker(each) for each in settings]
-    found: list[dict[str, Any]] = [{'right': [], 'ospa': [], 'snr': []} for _ in options]
+    found: list[dict[str, Any]] = [{'right': [], 'ospa': []} for _ in options]
     for record in range(config.records):
         depth = float(floor.array_depth_stated[record])
         if level == 'csdm':
@@ -106,15 +105,7 @@ def run(
                 right, distance = score(estimate, floor.depth[record])
                 rows['right'].append(right)
                 rows['ospa'].append(distance)
-                z, sigma = reflectors(estimate), float(estimate.extras['sigma'][0])
-                rows['snr'].append([strongest(z, at) / sigma for at in floor.depth[record]])
     return found
-
-
-def strongest(found: np.ndarray, depth: float) -> float:
-    """Amplitude of what was found (K, 2) within .4 m of a layer; NaN where nothing was."""
-    near = found[np.abs(found[:, 0] - depth) < 0.4, 1]
-    return float(near.max()) if len(near) else np.nan
 
 
 def row_of(runs: list[dict[str, Any]]) -> dict[str, float]:
@@ -128,8 +119,7 @@ def row_of(runs: list[dict[str, Any]]) -> dict[str, float]:
             value, error = mean(name, first)
             row[f'{title}{label}'] = value
             row[f'{title}{label}, s.e.'] = error
-    snr = np.nanmedian(np.concatenate([found['snr'] for found in runs]), axis=0)
-    return row | {f'SNR {k + 1}': float(value) for k, value in enumerate(snr)}
+    return row
 
 
 def main(runs: int = 20, particles: int = 5000, rows: Sequence[str] = ()) -> Parts:

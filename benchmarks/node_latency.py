@@ -10,7 +10,6 @@
 
     python -m benchmarks.node_latency --messages 600
     python -m benchmarks.node_latency --messages 600 --rates 0
-    python -m benchmarks.node_latency --system diver --loads 1000
 
 The diver node hears scans of four divers in clutter (`simulate diver --scenario crossing --set
 clutter=3`), the obstacle node detections of two obstacles with navigation and altitudes
@@ -21,10 +20,6 @@ estimate had: what is left is the cost of the middleware and of Python. Which of
 first changes every time. `--rates`: so many such pairs a second, or one after the other (0). Needs
 ROS 2. The load is that of the machine in the last minute, jobs that run or wait; with more of them
 than cores p99 is mostly waiting for a core.
-
-`--loads`: in place of that, the timed messages for `SECONDS`, each with the stamp of now, so many
-a second, and what /diagnostics says then: the age of the estimates, and the share of the messages
-that were lost or waited longer than `max_wait`.
 """
 
 from __future__ import annotations
@@ -32,7 +27,6 @@ from __future__ import annotations
 import array
 from collections.abc import Sequence
 from functools import partial
-import itertools
 import math
 import os
 import signal
@@ -41,12 +35,11 @@ import sys
 import time
 from typing import Any, NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from benchmarks.study import Parts, study
@@ -54,14 +47,14 @@ from msg_adapters.inputs import inputs_of
 from sonar_imm.nodes.messages import make
 from sonar_imm.nodes.qos import lockstep_qos, output_qos
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm_tools.replay.harness import local_discovery, NodeProcess, reserved_domain_id
+from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id
 from sonar_imm_tools.replay.link import Link, LinkError
 from sonar_imm_tools.simulation.bathymetry import simulator as bathymetry
 from sonar_imm_tools.simulation.diver import simulator as diver
 from sonar_imm_tools.simulation.fathometer import simulator as fathometer
 from sonar_imm_tools.simulation.obstacle import simulator as obstacle
 
-LIMIT, SECONDS = 90.0, 8.0
+LIMIT = 90.0
 SETTLED = 20
 """Messages at the start that are not counted: connections and caches are cold."""
 
@@ -201,52 +194,6 @@ def _asked(case: Case, node: Peer, other: Peer, rate: float) -> np.ndarray:
     return np.array(spent[SETTLED:])
 
 
-def ages(case: Case, rate: float, max_wait: float) -> dict[str, float]:
-    """What a node says of the age of its estimates when `rate` messages a second come."""
-    words = [w for name, value in case.options.items() for w in ('-p', _assigned(name, value))]
-    words += ['-p', f'max_wait:={max_wait}']
-    topic = f'/{case.timed}'
-    with reserved_domain_id() as domain, local_discovery():
-        with (
-            NodeProcess(case.system, domain_id=domain, arguments=words) as process,
-            Link('bench', domain_id=domain) as link,
-        ):
-            said: dict[str, str] = {}
-
-            def listen(message: DiagnosticArray) -> None:
-                said.update({pair.key: pair.value for of in message.status for pair in of.values})
-
-            link.node.create_subscription(DiagnosticArray, '/diagnostics', listen, output_qos())
-            messages = [message for key, message in case.messages if key == case.timed]
-            node = Peer(link, case.system, {case.timed: (topic, type(messages[0]))})
-            if not link.wait_for(lambda: node.ready() and said, LIMIT, process.trouble):
-                raise LinkError('the node did not appear')
-            begin = due = time.monotonic()
-            for message in itertools.cycle(messages):
-                if (due := due + 1.0 / rate) > begin + SECONDS:
-                    break
-                node.out[case.timed].publish(serialize_message(_stamped_now(message)))
-                if due > time.monotonic():
-                    link.wait_for(lambda: False, due - time.monotonic())
-            said.clear()
-            link.wait_for(lambda: said, LIMIT, process.trouble)
-            lost = sum(int(said.get(f'lost on {name}', 0)) for name in (topic, case.timed))
-            dropped = int(said.get(f'{case.timed} dropped, waited too long', 0))
-            sent = lost + int(said[f'{case.timed} received'])
-    return {
-        'messages': sent,
-        'age p50 s': float(said['age of estimates p50 [s]']),
-        'age p99 s': float(said['age of estimates p99 [s]']),
-        'lost': (lost + dropped) / sent,
-    }
-
-
-def _stamped_now(message: Any) -> Any:
-    stamp = message.header.stamp
-    stamp.sec, stamp.nanosec = divmod(time.time_ns(), 10**9)
-    return message
-
-
 def _passed(due: float) -> bool:
     return time.perf_counter() >= due
 
@@ -259,7 +206,6 @@ def main(
     messages: int = 600,
     rates: Sequence[float] = (10.0, 50.0, 200.0),
     system: str | None = None,
-    loads: Sequence[float] = (),
     echo: bool = False,
 ) -> Parts:
     if echo:
@@ -269,12 +215,7 @@ def main(
         except (KeyboardInterrupt, ExternalShutdownException):
             return
     for name in [system] if system else SYSTEMS:
-        for rate, max_wait in itertools.product(loads, (2.0, 0.0)):
-            row = ages(case_of(name, messages), rate, max_wait)
-            row['load'] = os.getloadavg()[0]
-            title = f'{name}, {rate:g} Hz, max_wait {max_wait:g} s'
-            yield {'age of estimates under load': {title: row}}
-        for rate in () if loads else rates:
+        for rate in rates:
             spent = latencies(case_of(name, messages), rate)
             node, other = np.percentile(spent, (50, 99), axis=0).T
             row = {'messages': len(spent), 'load': os.getloadavg()[0]}
@@ -289,7 +230,6 @@ if __name__ == '__main__':
         main,
         digits=2,
         rates={'help': 'messages a second; 0: no pause'},
-        loads={'type': float, 'help': 'messages a second, of now'},
         system={'choices': tuple(SYSTEMS), 'help': 'only that node'},
         echo={'help': 'be the node that only answers'},
     )

@@ -18,8 +18,7 @@ Each scene has `OBSTACLES` one behind the other, for as many runs from a third o
 `forecasts` compares stated probabilities of a collision with what happened, when the range first
 falls to 60, 45, 30, 20 and 10 m, by five bins: fixed, swaying and moving obstacles in `scenes`
 each, per altitude of the vehicle. `within 8 m` draws the vertical offset evenly over 8 m to both
-sides, at altitudes of 6 and 25 m (what would lie in the sea floor does not count); `over the beam`
-over what the beam shows 90 m ahead, and `near the sonar` within 5 m, both at 15 m. `error` is the
+sides, at altitudes of 6 and 25 m (what would lie in the sea floor does not count). `error` is the
 standard error of what happened less what was stated, from the sums of scenes: forecasts of an
 obstacle, and obstacles of a scene, err together. `early` has the forecasts at 60 and 45 m alone,
 `late` the others. `lost` is the share of the ranges at which the obstacle is not followed: no
@@ -54,12 +53,8 @@ from sonar_imm.truth import Scene
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
 ALTITUDES = (6.0, 25.0)
-DRAWN = {
-    'within 8 m': (8.0, ALTITUDES),
-    'near the sonar': (5.0, (15.0,)),
-    'over the beam': (11.5, (15.0,)),
-}
-"""Greatest vertical offset of the obstacles, m, and altitudes of the vehicle, m."""
+DRAWN, REACH = 'within 8 m', 8.0
+"""The case of forecasts, and the greatest vertical offset of its obstacles, m."""
 AT = (60.0, 45.0, 30.0, 20.0, 10.0)
 LATE = 30.0
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -117,15 +112,14 @@ def happened(truth: TrueObstacle, ping: int, radius: float, height: float) -> bo
     return bool(np.any((level_distance <= radius) & (np.abs(offset) <= height)))
 
 
-def forecasts(name: str, scenes: int, first: int, values: dict[str, Any]) -> dict[str, Any]:
-    """Tables of a case of `DRAWN`: what was stated and what happened, and Brier scores."""
-    reach, altitudes = DRAWN[name]
+def forecasts(scenes: int, first: int, values: dict[str, Any]) -> dict[str, Any]:
+    """Tables of what was stated and what happened, and Brier scores."""
     config = ObstacleConfig(**values)
     found: dict[str, list[Forecast]] = {misses: [] for misses in MISSES}
     asked, block = 0, 0
     for kind in KINDS:
-        for altitude in altitudes:
-            drawn = {'vertical_offset': 0.0, 'offset_spread': reach, 'altitude': altitude}
+        for altitude in ALTITUDES:
+            drawn = {'vertical_offset': 0.0, 'offset_spread': REACH, 'altitude': altitude}
             setting = scenario(kind, {**several(-10.0), **drawn})
             # Seeds of their own: those of other kinds have the same geometry.
             for seed in range(first + 10000 * block, first + 10000 * block + scenes):
@@ -139,7 +133,7 @@ def forecasts(name: str, scenes: int, first: int, values: dict[str, Any]) -> dic
                         rows = _stated(truth, final, config)
                         found[misses] += [(*row, seed) for row in rows]
             block += 1
-    return {misses: {name: _calibration(rows, asked)} for misses, rows in found.items()}
+    return {misses: {DRAWN: _calibration(rows, asked)} for misses, rows in found.items()}
 
 
 def _stated(
@@ -241,15 +235,15 @@ def main(
     scenes: int = 28,
     approaches: int = 5,
     first: int = 300000,
-    cases: Sequence[str] = ('within 8 m',),
+    cases: Sequence[str] = (DRAWN,),
     tracker: Sequence[str] = (),
 ) -> Parts:
     yield {'obstacles': OBSTACLES * scenes, 'approaches': OBSTACLES * approaches, 'first': first}
     values = dict(map(parsed, tracker))
     rows: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for name in cases:
-        if name in DRAWN:
-            yield forecasts(name, scenes, first, values)
+        if name == DRAWN:
+            yield forecasts(scenes, first, values)
             continue
         if name == 'band':
             every = [(altitude, offset) for altitude in ALTITUDES for offset in OFFSETS]
@@ -280,6 +274,6 @@ if __name__ == '__main__':
     study(
         main,
         first={'help': 'first seed'},
-        cases={'choices': (*DRAWN, 'band', 'beam')},
+        cases={'choices': (DRAWN, 'band', 'beam')},
         tracker={'help': 'name=value of the tracker'},
     )

@@ -102,7 +102,7 @@ def study(
         sys.stdout.flush()
         write_json(out, content, before)
     for title, table in tables(content, shown):
-        if len(table) != printed.get(title, 0):
+        if len(table) != printed.get(title, len(table)):
             print(f'\n{title}\n\n{markdown(table, digits)}')
 
 

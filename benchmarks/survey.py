@@ -51,7 +51,7 @@ from sonar_imm_tools.survey.adjustment import adjust
 from sonar_imm_tools.survey.chart import chart_of
 from sonar_imm_tools.survey.grid import grid_of_looks, Soundings
 from sonar_imm_tools.survey.jobs import Options
-from sonar_imm_tools.survey.line import joined_lines, line_of
+from sonar_imm_tools.survey.line import Line, line_of
 from sonar_imm_tools.survey.looks import Looks, looks_of, runs_of
 from sonar_imm_tools.survey.making import make, Progress, sources_of
 from sonar_imm_tools.survey.products import folder_of, write
@@ -157,7 +157,7 @@ def survey(seed: int, interval: float) -> tuple[dict[str, float], dict[str, dict
         ('not adjusted', lines, None, found.rms[0], 0.0),
     ):
         number = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
-        soundings = Soundings(joined_lines(parts), number)
+        soundings = Soundings(Line.joined(parts), number)
         charts[f'looks, {name}'] = looks_scores(scene.floor, soundings, own, C, left, level_std)
         whole = soundings.line
         x, y = whole.xy.T
@@ -182,8 +182,7 @@ def looks_scores(
     box = (first, first, last - first, last - first)
     nodes = grid_of_looks(soundings, 1.0, box, errors, covariance, crossing_rms)
     place = np.asarray(np.column_stack([nodes.ix, nodes.iy]) + 0.5, np.float64)
-    competing = float(np.mean(nodes.hypotheses > 1))
-    return {**about_level(floor, place, nodes.z, nodes.sd, level_std), 'competing': competing}
+    return about_level(floor, place, nodes.z, nodes.sd, level_std)
 
 
 def about_level(
@@ -195,17 +194,14 @@ def about_level(
     off = error - np.median(error)
     return {
         'rmse': rms(off),
-        'median': float(np.median(np.abs(off))),
-        'beyond': float(np.mean(np.abs(off) > 0.5)),
         'inside': float(np.mean(np.abs(error) < 2.0 * sd)),
         'level_inside': float(np.mean(np.abs(off) < 2.0 * relative)),
-        'relative_sd': float(np.median(relative)),
         'sd': float(np.median(sd)),
     }
 
 
 def walls(seed: int) -> dict[str, float]:
-    """Errors about their median on the sides of the wreck and on all nodes beside it."""
+    """Errors about their median on the sides of the wreck."""
     scene = simulate(scenario('survey', WRECK), seed)
     parts = [
         line_of(points, budget()).corrected(c)
@@ -213,7 +209,7 @@ def walls(seed: int) -> dict[str, float]:
     ]
     number = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
     own = evolve(budget(), sound_speed=0.0)
-    nodes = grid_of_looks(Soundings(joined_lines(parts), number), 1.0, (20, 0, 120, 120), own)
+    nodes = grid_of_looks(Soundings(Line.joined(parts), number), 1.0, (20, 0, 120, 120), own)
     x, y = np.asarray(np.column_stack([nodes.ix, nodes.iy]) + 0.5, np.float64).T
     error = nodes.z - scene.floor.at(x, y)
     off = np.abs(error - np.median(error))
@@ -222,9 +218,7 @@ def walls(seed: int) -> dict[str, float]:
     side = (out > 0.8) & (np.abs(along) < 22.0) & (np.abs(across) < 6.0)
     return {
         'rms': rms(off[side]),
-        'p95': float(np.quantile(off[side], 0.95)),
         'inside': float(np.mean(off[side] < 2.0 * nodes.sd[side])),
-        'others_rms': rms(off[~side & (out > 0.8)]),
     }
 
 

@@ -153,7 +153,7 @@ class Numbers:
         return [name for name in self.at(path) if part in name] if self.has(path) else []
 
     def sources(self) -> str:
-        """Return one line with the files that were read so far and stand below no table, if any."""
+        """Return one line with the files that were read and stand below no table; "" for none."""
         others = '; '.join(map(self.made, sorted(self.files.keys() - self.captioned)))
         return others and f'<small>Numbers in the text: {others}</small>'
 

@@ -342,9 +342,9 @@ def test_errors_are_what_is_attainable(paper_pings, method):
     assert rms == pytest.approx(ATTAINABLE[method], rel=0.06)
 
 
-# -- one ping of a split-beam echo sounder as an array of two staves: phase, geometry and coherence
+# -- one ping of a split-beam echo sounder as an array of two staves: phase, geometry, coherence
 # gate work on samples of a real instrument. The calibration sphere is at its range and angle, the
-# floor straight below. A beam of 7 degrees with halves 3.7 wavelengths apart is no swath ----------
+# floor straight below. A beam of 7 degrees with halves 3.7 wavelengths apart is no swath ---------
 
 ROOT = Path(__file__).resolve().parents[2]
 PING = Path(os.environ.get('SONAR_IMM_DATA', ROOT / '../shared/data')) / 'crimac_ek80/ping.npz'

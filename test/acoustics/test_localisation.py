@@ -466,7 +466,7 @@ def test_the_distance_from_a_fix_needs_no_inverse():
         np.testing.assert_allclose(candidate.distance2(gap), wanted, rtol=1e-6)
 
 
-# -- a real recording: an acoustic tag towed past 19 hydrophones, hand-held GPS as truth. Times have
+# -- a real recording: an acoustic tag towed past 19 hydrophones, GPS in hand as truth. Times have
 # a standard deviation of 0.9 ms (1.4 m): with it the chi-square of residuals is what it should be.
 # The tag is towed behind the receiver, and GPS itself is metres-grade ----------------------------
 

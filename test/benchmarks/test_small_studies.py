@@ -30,7 +30,7 @@ SMALL = {
         {},
         'table>30 missing, walk 0.1 m, Kalman>inside',
     ),
-    'image_detector': ({'runs': 1, 'images': 1}, {}, 'found>steady>21 dB'),
+    'obstacle_accuracy': ({'runs': 5, 'cases': ['images']}, {}, 'images>found>steady>21 dB'),
 }
 """Options, what is made smaller besides, and a number."""
 

@@ -475,10 +475,12 @@ def record(line, bag, *topics):
     ],
 )
 def test_what_cannot_be_done_is_one_sentence_and_writes_nothing(
-    lines, tmp_path, capsys, change, options, words
+    lines, tmp_path, capsys, monkeypatch, change, options, words
 ):
     if 'nonsense' in options:
         pytest.importorskip('distributed')
+    if '--crs' in options:  # is refused before the work
+        monkeypatch.setattr('sonar_imm_tools.survey.making.make', None)
     runs, out = tmp_path / 'runs', tmp_path / 'out'
     if change != 'missing':
         runs.mkdir()

@@ -182,6 +182,17 @@ def test_what_is_kept_of_equal_sets_changes_no_bit(model, exact, change):
             assert found.amplitude[0].tobytes() == step.amplitude[i].tobytes()
 
 
+def test_sums_over_members_are_those_of_a_loop(model, exact):
+    tracker = SetFilter(model, 300)
+    step = cycle(tracker, None, exact['B'][3], (1, 2))
+    wanted = np.zeros((5, model.cells))
+    for w, order, cell, a in zip(step.w, step.sets.order, step.sets.cell, step.amplitude):
+        for k in range(order):
+            wanted[:4, cell[k]] += w * np.array([1.0, a[k], a[k] ** 2, model.amplitude_std**2])
+        wanted[4, cell[:order][:1]] += w
+    np.testing.assert_allclose(tracker.summarise(step).sums, wanted, atol=1e-12)
+
+
 def test_the_likelihood_is_that_of_the_whole_record():
     """Least squares on every sample, noise as correlated as the pulse, is b' G^-1 b / 2."""
     n, places, sigma = 40, np.array([8, 15, 22]), 0.3

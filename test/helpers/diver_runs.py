@@ -36,6 +36,11 @@ def scan_of(second, places, std=0.5, **more):
     )
 
 
+def scan(second, *places, **more):
+    """Fixes at the places, each good to half a metre."""
+    return scan_of(second, places, **more)
+
+
 def arrivals(stamp_ns, rx, toa, **more):
     """Times toa (n,) heard at receivers rx (n, 3), of one tag unless `tx` (3,) or (n, 3) says
     where the transmitter is; good to a tenth of a millisecond, and without bearings."""

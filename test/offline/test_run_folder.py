@@ -15,9 +15,11 @@ import re
 from helpers.commands import contents
 from helpers.dive_bags import write_dive
 from helpers.dive_scenes import single_run, START_NS
+from helpers.estimates import same
 import numpy as np
 import pytest
 
+from sonar_imm.estimates import Estimate
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.offline.run_folder import (
     CsvTable,
@@ -201,6 +203,23 @@ def test_parquet_has_the_columns_types_and_numbers_of_the_csv(tmp_path):
         as_text = np.array([float(row[k]) for row in rows])
         np.testing.assert_array_equal(read[name].to_numpy().astype(float), as_text)
     assert read.schema.metadata[b'system'] == b'diver'
+
+
+def test_bins_of_one_stamp_and_side_are_one_estimate(tmp_path, monkeypatch):
+    pytest.importorskip('pyarrow.parquet')
+    columns = {name: np.repeat(column, 2) for name, column in ESTIMATES[0].columns().items()}
+    made = [
+        Estimate.from_columns(
+            {**columns, 'side': np.full(2, side)}, stamp_ns=stamp, frame_id='map'
+        )
+        for stamp, side in ((5, 0), (5, 1), (6, 1), (7, 0))
+    ]
+    with ParquetTable(tmp_path / 'bins.parquet', {'frame_id': 'map'}) as table:
+        for estimate in made:
+            table.write(estimate.stamp_ns, estimate.columns())
+    monkeypatch.setattr(RunFolder, 'bins', lambda self: self.path / 'bins.parquet')
+    for read, estimate in zip(RunFolder(tmp_path).read_estimates(), made, strict=True):
+        assert same(read, estimate)
 
 
 @pytest.mark.parametrize('rows, count', [(0, 0), (0, 3), (1, 5), (65535, 3)])

@@ -303,6 +303,7 @@ def test_waiting_ends_by_the_limit_or_by_trouble():
         ('/fix: {reliability: often}', "reliability is one of .*, got 'often'"),
         ('/fix: {deadline: 1}', "'deadline' is none of depth, history"),
         ('/fix: 5', 'a mapping of policies for each topic'),
+        ('/fix: 5\n/ping: {depth: 1}', 'a mapping of policies for each topic'),
         ('{[', 'not a YAML file'),
     ],
 )

@@ -7,12 +7,15 @@
 # language governing permissions and limitations under the License.
 
 """Divers, obstacles, images and the filters of the package compile nothing, seen in a process
-of its own: this one has loaded the compiler."""
+of its own: this one has loaded the compiler. Trackers warn of variances that cannot be true."""
 
 import subprocess
 import sys
 
 from helpers.tracked import BAGS
+import pytest
+
+from benchmarks.false_warnings import runs
 
 PROGRAM = """
 import sys
@@ -59,3 +62,10 @@ def test_no_compiler_stands_before_the_first_estimate():
     words = [sys.executable, '-c', PROGRAM, str(BAGS)]
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize('name', ['obstacle_movers', 'diver_multistatic'])
+@pytest.mark.parametrize('factor, warned', [(1.0, False), (2.0, True), (0.5, True)])
+def test_only_variances_that_are_not_true_are_warned_of(name, factor, warned):
+    ((_, raised),) = runs(BAGS / name, factor, range(1, 2))
+    assert bool(raised) == warned

@@ -111,20 +111,30 @@ def test_shared_parameters_come_from_their_base(system):
             assert issubclass(config_type, base)
 
 
-def test_confirmation_cannot_ask_for_more_hits_than_it_looks_at():
-    with pytest.raises(ConfigError, match='cannot exceed confirm_window'):
-        SYSTEMS['diver'].config_type()(confirm_hits=8, confirm_window=7)
+@pytest.mark.parametrize(
+    'system, changed, fixed',
+    [
+        ('diver', {'gate_probability': 0.99}, {'directions': 8}),
+        ('fathometer', {'existence_min': 0.7}, {'particles': 7}),
+        ('obstacle', {'birth_rate': 1.0}, {'components': 5}),
+    ],
+)
+def test_a_running_tracker_takes_over_what_may_change(system, changed, fixed):
+    config = SYSTEMS[system].config_type()
+    tracker = SYSTEMS[system].build(config())
+    tracker.reconfigure(config(**changed))
+    assert all(getattr(tracker.config, name) == value for name, value in changed.items())
+    with pytest.raises(ValueError, match=next(iter(fixed))):
+        tracker.reconfigure(config(**fixed))
 
 
 def test_a_chain_is_checked_once_for_all():
     assert matrix_problems((), 3, 'three') == []
     assert matrix_problems((1.0, 0.0, 0.5, 0.5), 2, 'two') == []
-    assert matrix_problems((1.0,), 2, 'two', name='P') == [
-        'P needs 2 x 2 = 4 values for two, got 1'
-    ]
-    assert matrix_problems((0.9, 0.2, 0.5, 0.5), 2, 'two', name='P') == [
-        'row 0 of P sums to 1.1, not 1'
-    ]
+    (few,) = matrix_problems((1.0,), 2, 'two', name='P')
+    assert few == 'P needs 2 x 2 = 4 values for two, got 1'
+    (wrong,) = matrix_problems((0.9, 0.2, 0.5, 0.5), 2, 'two', name='P')
+    assert wrong == 'row 0 of P sums to 1.1, not 1'
     assert chain_problems((), (0.5, 0.6), 2, 'two') == ['initial_probabilities sum to 1.1, not 1']
 
 

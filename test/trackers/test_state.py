@@ -6,21 +6,31 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The file of a state: what it holds, and what is refused. That a tracker goes on from it bit for
-bit is in test/conformance."""
+"""The file of a state: what it holds, what is refused; states of trackers with every option are
+written and taken again. That a tracker goes on from it bit for bit is in test/conformance."""
 
 from collections import deque
+import contextlib
 import hashlib
+from importlib import import_module
 
 import attrs
 from helpers.hostile.states import forge, parts_of
-from helpers.tracked import resumed, tracked, tracker_from
+from helpers.tracked import BAGS, resumed, saved, tracked, tracker_from
 import numpy as np
 import pytest
 
+from sonar_imm.intake import Intake
+from sonar_imm.measurements import Rejection
+from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import state_file, SYSTEMS
-from sonar_imm.trackers.state_file import read_state, StateError, write_state
+from sonar_imm.trackers.state_file import intake_from, read_state, StateError, write_state
 from sonar_imm.trackers.state_values import Decoder, encoded, frozen_state
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.cli.common import load_config
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.own_files import own_parameters
+from sonar_imm_tools.recordings.reader import BagReader
 
 
 @pytest.fixture
@@ -162,3 +172,74 @@ def test_a_state_that_cannot_be_written_leaves_the_old_one(file, monkeypatch):
         write_state(file, run.saved(run.until(6)))
     assert file.read_bytes() == before
     assert [path.name for path in file.parent.iterdir()] == ['state']
+
+
+QUICK = {'fathometer': {'particles': '200'}}
+SHORT = {'fathometer': ['--set', 'records=8']}
+MOST = 48
+BAG = {
+    'bathymetry': 'bathymetry_ship',
+    'diver': 'diver_multistatic',
+    'fathometer': 'fathometer_pressure',
+    'obstacle': 'obstacle_wreck',
+}
+
+
+def values_of(spec):
+    """Texts of `--set` that use what a parameter can switch on."""
+    if spec.choices:
+        return spec.choices
+    if spec.kind == 'bool':
+        return ('true', 'false')
+    if spec.kind in ('int', 'float') and spec.default == 0:
+        return (str(2 if spec.high is None else min(spec.high, 2)),)
+    return ()
+
+
+def take_again(name, bag, own, overrides, path):
+    """Save the state of intake and tracker again and again, and load it: the same bytes."""
+    system = SYSTEMS[name]
+    config = load_config(system, own, QUICK.get(name, {}) | overrides)[0]
+    intake = Intake(system.build(config))
+    with BagReader(bag) as reader:
+        read = measurements_of(reader, name, settings=config.as_dict())
+        found = [item.measurement for item in read]
+    found = [m for m in found if m is not None and not isinstance(m, Rejection)][:MOST]
+    for k, measurement in enumerate(found):
+        with contextlib.suppress(Rejection):
+            admitted = intake.admit(measurement)
+            if admitted is not None:
+                intake.tracker.process(admitted)
+        if k % 16 == 0 or k == len(found) - 1:
+            write_state(path, saved(intake, system))
+            first = path.read_bytes()
+            again = intake_from(read_state(path), system, config)
+            write_state(path, saved(again, system))
+            assert path.read_bytes() == first, (bag.name, overrides, k)
+
+
+@pytest.mark.parametrize('name', SYSTEMS)
+def test_states_on_every_shipped_recording(name, tmp_path):
+    bags = sorted(BAGS.glob(f'{name}_*'))
+    for bag, own in [*((bag, own_parameters(bag)) for bag in bags), (bags[0], None)]:
+        take_again(name, bag, own, {}, tmp_path / 'state')
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize('name', SYSTEMS)
+def test_states_with_every_option(name, tmp_path):
+    bag = BAGS / BAG[name]
+    for spec in SYSTEMS[name].config_type().specs():
+        for value in values_of(spec):
+            with contextlib.suppress(ConfigError):  # some need others beside them
+                take_again(name, bag, own_parameters(bag), {spec.name: value}, tmp_path / 'state')
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize('name', SYSTEMS)
+def test_states_on_every_scene(name, tmp_path, capsys):
+    for scene in import_module(f'sonar_imm_tools.simulation.{name}').SCENARIOS:
+        bag = tmp_path / scene
+        words = ['simulate', name, str(bag), '--scenario', scene, *SHORT.get(name, [])]
+        assert main(words) == 0
+        take_again(name, bag, own_parameters(bag), {}, tmp_path / 'state')

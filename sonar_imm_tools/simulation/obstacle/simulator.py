@@ -42,7 +42,6 @@ _SWAY_STEP = 0.1
 WAVES = 3
 """Sinusoids that make up a swing, with periods of 0.75 to 1.3 times the stated one: narrow-band,
 as swell is. The study that docs/obstacle.md compares with has such swings."""
-FOR_EVER = 1e9
 _AHEAD = np.radians(12.0)
 """A mover comes from within this of the course on either side, so that a sonar can see it."""
 
@@ -70,8 +69,8 @@ class Path:
     speed: FloatArray | None = None
     sway: FloatArray | None = None
     swing: tuple[Swing, Swing] | None = None
-    starts: float = -FOR_EVER
-    stops: float = FOR_EVER
+    starts: float = -np.inf
+    stops: float = np.inf
 
     def moves(self, t: FloatArray) -> np.ndarray:
         """Whether it moves at the times t (n,)."""

@@ -175,9 +175,12 @@ def test_a_pair_is_the_floor_where_both_lines_rather_take_it_for_it(first, secon
         Horizon(1, 20.0, 0.1, 0.0, is_bottom=share, multiple=0.0, cut=False)
         for share in (first, second)
     )
+    further = first._replace(depth=21.0)
     for pair in ([first], [other]), ([other], [first]):
         [horizon] = compared(*pair, 1.0, np.eye(2), 0.0)['horizons']
         assert horizon['bottom'] == bottom
+    # Of those a separation apart nobody knows that they are one.
+    assert compared([first], [further], 1.0, np.eye(2), 0.0)['horizons'] == []
 
 
 def test_shift_and_spread_of_differences_that_are_known():

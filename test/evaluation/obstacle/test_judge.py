@@ -17,11 +17,11 @@ import pytest
 from scipy.special import ndtr
 
 from sonar_imm.estimates import Estimate, places
-from sonar_imm.measurements import Altitude, Detections
+from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
-from sonar_imm_tools.evaluation.obstacle.figures import error_figure, image_figure
+from sonar_imm_tools.evaluation.obstacle.figures import error_figure, image_figure, map_section
 from sonar_imm_tools.evaluation.obstacle.scoring import score, tether_length
 from sonar_imm_tools.evaluation.obstacle.series import series_of, TruePath, truth_of
 from sonar_imm_tools.offline.run_folder import RunFolder
@@ -87,6 +87,26 @@ def test_the_image_is_seen_from_above_with_starboard_to_the_right():
     ):
         np.testing.assert_allclose(np.ravel(drawn.x), -distance * np.sin(bearing), atol=0.01)
         np.testing.assert_allclose(np.ravel(drawn.y), distance * np.cos(bearing), atol=0.01)
+
+
+def test_the_map_shows_the_way_and_names_each_track():
+    rows = [[k, 1, 10.0 * k, 0.2, 3.0, 1.0, 2.0, 5.0, 0.1] for k in (4, 7)]
+    way = [
+        Navigation(
+            stamp_ns=s * SECOND, position=[3.0 * s, s, 0.0], orientation=[0.0, 0.0, 0.0, 1.0]
+        )
+        for s in (1, 2)
+    ]
+    (section,) = map_section(series_of([estimate(10, rows)]), way, None)
+    vehicle, *tracks = section.figure.data
+    assert (list(vehicle.x), list(vehicle.y), vehicle.hovertemplate) == (
+        [3.0, 6.0],
+        [1.0, 2.0],
+        None,
+    )
+    for track, number, x in zip(tracks, (4, 7), (40.0, 70.0), strict=True):
+        assert list(track.x) == [x] and list(track.y) == pytest.approx([0.2])
+        assert track.hovertemplate.startswith(f'track {number}: ')
 
 
 def test_scores_are_those_done_by_hand():

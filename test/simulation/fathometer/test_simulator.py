@@ -22,7 +22,6 @@ from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of
 from sonar_imm_tools.simulation.fathometer.simulator import (
     _envelope,
     cross_spectra,
-    expected_csdm,
     scenario,
     SCENARIOS,
     simulate,
@@ -64,11 +63,9 @@ def test_traces_hold_the_pulse_of_each_layer_and_noise_as_stated():
         assert amplitude > 0.01
     assert np.std(noise) == pytest.approx(1.3e-3, rel=0.05)
     # The noise is as correlated as the pulse.
-    lag = 3
-    seen = np.mean(np.multiply(np.array(noise)[:, lag:], np.array(noise)[:, :-lag])) / np.var(
-        noise
-    )
-    assert seen == pytest.approx(band_pulse(50.0, 4000.0, 1500.0)(lag / 32.0), abs=0.05)
+    noise = np.array(noise)
+    seen = np.mean(noise[:, 3:] * noise[:, :-3]) / np.var(noise)
+    assert seen == pytest.approx(band_pulse(50.0, 4000.0, 1500.0)(3.0 / 32.0), abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -115,10 +112,8 @@ def test_whitened_spectra_are_even():
         simulate(scenario('small', {**changes, 'whitened': white}), 1).measurements[-1].measurement
         for white in (False, True)
     )
-    ratio = [
-        np.einsum('fmm->f', item.csdm).real[10] / (np.einsum('fmm->f', item.csdm).real[-10])
-        for item in (red, even)
-    ]
+    power = [np.einsum('fmm->f', item.csdm).real for item in (red, even)]
+    ratio = [each[10] / each[-10] for each in power]
     assert ratio[0] > 20.0 and 0.5 < ratio[1] < 2.0
 
 
@@ -158,10 +153,8 @@ def expected(frequency, config, heights, amplitudes, ships=True):
             slant = np.linspace(-0.2, 0.2, 2001)
             density = np.exp(-0.5 * (slant / 0.03) ** 2)
             wave = np.exp(1j * k * np.outer(slant, up))
-            level = config.ship_noise / (1.0 + (f / 200.0) ** 2)
-            total = total + level * np.einsum(
-                'u,ui,uj->ij', density / density.sum(), wave, wave.conj()
-            )
+            share = config.ship_noise / (1.0 + (f / 200.0) ** 2) * density / density.sum()
+            total = total + np.einsum('u,ui,uj->ij', share, wave, wave.conj())
         R.append(total * (f / 1000.0) ** -1.6)
     return np.array(R)
 
@@ -209,11 +202,8 @@ def test_a_draw_scatters_as_an_average_of_that_many_snapshots(snapshots):
 def test_a_ship_that_passes_is_a_hundred_times_louder():
     config, quiet = drawn(100_000)
     _, loud = drawn(100_000, ship_pass=(0, 3))
-    R = [
-        expected(quiet.frequency, config, *LAYERS, ships=False),
-        expected(quiet.frequency, config, *LAYERS),
-    ]
-    ratio = np.mean(np.abs(loud.csdm - R[0])) / np.mean(np.abs(quiet.csdm - R[0]))
+    R = expected(quiet.frequency, config, *LAYERS, ships=False)
+    ratio = np.mean(np.abs(loud.csdm - R)) / np.mean(np.abs(quiet.csdm - R))
     assert ratio == pytest.approx(100.0, rel=0.03)
 
 
@@ -262,25 +252,21 @@ def test_the_array_heaves_and_its_depth_is_told_with_an_error():
 
 
 def test_layers_wander_together_and_alone_as_told():
-    config = scenario(
-        'drift', {'records': 4000, 'depth_walk': 0.03, 'tilt_walk': 0.0, 'appearing': ()}
-    )
-    steps = np.diff(drift_of(config, np.random.default_rng(2)).depth, axis=0)
+    def walked(**walks):
+        config = scenario('drift', {'records': 4000, 'appearing': (), **walks})
+        return np.diff(drift_of(config, np.random.default_rng(2)).depth, axis=0)
+
+    steps = walked(depth_walk=0.03, tilt_walk=0.0)
     assert steps.std() == pytest.approx(0.03, rel=0.03)
-    correlation = np.corrcoef(steps.T)
-    assert np.abs(correlation - np.eye(8)).max() < 0.08
-    config = scenario(
-        'drift', {'records': 4000, 'depth_walk': 0.0, 'tilt_walk': 0.05, 'appearing': ()}
-    )
-    steps = np.diff(drift_of(config, np.random.default_rng(2)).depth, axis=0)
+    assert np.abs(np.corrcoef(steps.T) - np.eye(8)).max() < 0.08
+    steps = walked(depth_walk=0.0, tilt_walk=0.05)
     assert steps.std() == pytest.approx(0.05, rel=0.05)
     np.testing.assert_allclose(steps, steps[:, :1] @ np.ones((1, 8)), atol=1e-12)
 
 
 def test_the_truth_names_what_is_there():
-    scene = simulate(
-        scenario('drift_traces', {'records': 40, 'appearing': (20,), 'fading': (5,)}), 1
-    )
+    changes = {'records': 40, 'appearing': (20,), 'fading': (5,)}
+    scene = simulate(scenario('drift_traces', changes), 1)
     first, middle, last = (scene.truth[k] for k in (0, 15, 39))
     assert first.track_id.tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
     assert len(middle.track_id) == 7 and set(middle.track_id) < set(first.track_id)
@@ -300,13 +286,3 @@ def test_a_profiler_hears_its_own_noise_alone_where_there_is_no_floor():
         _envelope(config, each, 0, np.random.default_rng(1))[0] for each in (drift, bare)
     )
     assert silent.max() < 0.2 * heard.max() and len(silent) == len(heard)
-
-
-def test_the_noise_of_ships_falls_by_half_at_200_hertz():
-    config = scenario('drift', {'records': 1, 'ship_noise': 2.0, 'whitened': True})
-    drift, at = drift_of(config, np.random.default_rng(0)), np.array([1.0, 200.0, 600.0])
-    loud, quiet = (
-        expected_csdm(each, drift, 0, at) for each in (config, evolve(config, ship_noise=0.0))
-    )
-    power = np.einsum('fmm->f', loud - quiet).real
-    assert power / power[0] == pytest.approx([1.0, 0.5, 0.1], rel=1e-4)

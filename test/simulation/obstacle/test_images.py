@@ -22,6 +22,9 @@ LEVEL = Pose(np.array([0.0, 0.0, 20.0]), np.eye(3))
 NOWHERE = {'reverberation': 0.0, 'altitude': 5000.0, 'image_gain': 40.0}
 
 
+# -- speckle, reverberation, sea floor and targets of images --------------------------------------
+
+
 def sonar(seed=0, **values):
     config = scenario('approach', {'images': True, **values})
     return ImageSonar(config, np.random.default_rng(seed))
@@ -30,9 +33,8 @@ def sonar(seed=0, **values):
 def powers(imager, count, places=(), pose=LEVEL):
     """Mean power over images, in units of the noise."""
     gain = imager.config.image_gain
-    return np.mean(
-        [np.square(imager.image(pose, list(places), 1.0) / gain) for _ in range(count)], axis=0
-    )
+    images = [imager.image(pose, list(places), 1.0) / gain for _ in range(count)]
+    return np.mean(np.square(images), axis=0)
 
 
 def correlation(power, axis, lag):
@@ -175,18 +177,14 @@ def test_images_take_the_place_of_detections_and_the_rest_stays():
     plain = simulate(scenario('approach', values), seed=3)
     scene = simulate(scenario('approach', {**values, 'images': True}), seed=3)
     again = simulate(scenario('approach', {**values, 'images': True}), seed=3)
-    images = [
-        item.measurement for item in scene.measurements if hasattr(item.measurement, 'delay')
-    ]
-    assert len(images) == 14 and isinstance(images[0], SonarImage)
-    assert images[0].amplitude.shape == (200, 64)
-    same = [item.measurement for item in again.measurements if hasattr(item.measurement, 'delay')]
+    images, same = (
+        [x.measurement for x in each.measurements if isinstance(x.measurement, SonarImage)]
+        for each in (scene, again)
+    )
+    assert len(images) == 14 and images[0].amplitude.shape == (200, 64)
     assert all((a.amplitude == b.amplitude).all() for a, b in zip(images, same))
     np.testing.assert_array_equal(scene.truth[0].vertical_offset, plain.truth[0].vertical_offset)
     others = [len(item.measurements) - 14 for item in (scene, plain)]
     assert others[0] == others[1]
-
-
-def test_images_of_two_instants_are_refused():
     with pytest.raises(ConfigError, match='instant'):
         scenario('approach', {'images': True, 'ping_timing': 'two_way'})

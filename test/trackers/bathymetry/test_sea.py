@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The tracker on a ship that moves: the vectors of motion, mistakes that must be seen, gaps."""
+"""The tracker on a ship that moves: the vectors of motion, gaps, pings that wait for poses."""
 
 from attrs import evolve
 from helpers.sea import motion_case, navigation, sea_config, snapshots, START_NS, swath_of
@@ -16,11 +16,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_imm.estimates import PLACES
-from sonar_imm.measurements import Altitude, Navigation
-from sonar_imm.parameters import ConfigError
+from sonar_imm.measurements import Altitude, Navigation, Snapshot
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers.bathymetry.likelihood import level_geometry
-from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm.trackers.bathymetry.ping import bin_stamps
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker, PoseQueue
+from sonar_imm.trackers.navigation import MOST_WAITING
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 CASE = motion_case()
@@ -87,9 +88,6 @@ def test_the_right_swath_has_the_truth_in_it():
     assert np.sqrt(np.mean(np.square(found))) < 0.02
 
 
-# -- navigation that is late, has gaps, or is none ------------------------------------------------
-
-
 @pytest.mark.parametrize('order', ['by stamp', 'pings first'])
 def test_pings_wait_for_poses_in_whatever_order_they_come(order):
     config = sea_config(CASE, navigation='required', particles_per_model=20)
@@ -126,14 +124,8 @@ def test_without_navigation_nothing_changes_and_with_it_the_columns_say_more():
     posed, _ = track(sea_config(CASE, particles_per_model=20))
     assert posed[0].frame_id == 'map' and plain.frame_id == 'sonar'
     extra = [name for name in posed[0].columns() if name not in plain.columns()]
-    assert extra == [
-        'vertical_uncertainty',
-        'horizontal_uncertainty',
-        'intensity',
-        'beam_angle',
-        *PLACES,
-        'side',
-    ]
+    before = 'vertical_uncertainty horizontal_uncertainty intensity beam_angle'
+    assert extra == [*before.split(), *PLACES, 'side']
 
 
 @pytest.mark.parametrize('seconds, used', [(3600, 2), (3601, 1)])
@@ -143,9 +135,6 @@ def test_a_pose_from_more_than_an_hour_ahead_is_not_believed(seconds, used):
     tracker.process(pose)
     tracker.process(evolve(pose, stamp_ns=pose.stamp_ns + seconds * 10**9))
     assert tracker.counts['poses'] == used
-
-
-# -- start and nadir ------------------------------------------------------------------------------
 
 
 def test_the_altitude_replaces_the_height_for_the_start():
@@ -201,24 +190,6 @@ def test_kernels_agree_with_the_formulas_of_the_array(of_heights):
     assert out == pytest.approx(expected, abs=1e-12)
 
 
-# -- what is refused ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    'values, word',
-    [
-        ({'sonar_lever': [1.0, 2.0]}, 'sonar_lever needs three'),
-        ({'sound_speed_profile': [0.0, 1500.0, 1.0]}, 'in turn'),
-        ({'sound_speed_profile': [5.0, 1500.0, 1.0, 1500.0]}, 'increasing'),
-        ({'sound_speed_profile': [0.0, 15.0]}, 'between'),
-        ({'sound_speed_profile': [0.0, 1500.0], 'navigation': 'ignored'}, 'needs navigation'),
-    ],
-)
-def test_mistakes_in_the_parameters_are_named(values, word):
-    with pytest.raises(ConfigError, match=word):
-        BathymetryConfig.from_mapping(values)
-
-
 def test_a_recording_says_whether_there_is_navigation():
     assert BathymetryConfig().for_inputs(frozenset({'snapshot'})).navigation == 'ignored'
     assert BathymetryConfig().for_inputs(frozenset({'snapshot', 'nav'})).navigation == 'required'
@@ -272,22 +243,13 @@ def test_a_heading_that_passes_through_180_degrees_is_no_jump():
         assert b.xyz == pytest.approx(turn.apply(np.array(a.xyz, float)), abs=2e-5)
 
 
-def in_summer(**changes):
-    scene = scenario('moving_profile', {'pings': 2, 'ping_rate': 0.3, **EXACT, **changes})
+def test_depth_in_the_profile_is_counted_from_the_surface():
+    """The same sea 40 m higher: the floor is 40 m higher, and bends as before."""
+    scene = scenario('moving_profile', {'pings': 2, 'ping_rate': 0.3, **EXACT})
     made = simulate(scene, 3)
     config = BathymetryConfig.from_mapping(scene.instruments())
     config = config.for_inputs(frozenset({'snapshot', 'nav'}))
-    return made, config, [each.measurement for each in made.measurements]
-
-
-def height_rmse(estimates, truth):
-    error = np.array([each.state[:, 0] for each in estimates]) - [each.height for each in truth]
-    return float(np.sqrt(np.mean(np.square(error))))
-
-
-def test_depth_in_the_profile_is_counted_from_the_surface():
-    """The same sea 40 m higher: the floor is 40 m higher, and bends as before."""
-    made, config, measurements = in_summer()
+    measurements = [each.measurement for each in made.measurements]
     lifted = [
         evolve(each, position=each.position + [0.0, 0.0, 40.0])
         if isinstance(each, Navigation)
@@ -298,4 +260,94 @@ def test_depth_in_the_profile_is_counted_from_the_surface():
     higher = tracked(evolve(config, water_level=config.water_level + 40.0), lifted)
     for a, b in zip(plain, higher, strict=True):
         assert b.state[:, 0] - 40.0 == pytest.approx(a.state[:, 0], abs=1e-6)
-    assert height_rmse(plain, made.truth) < 0.17
+    error = np.array([each.state[:, 0] for each in plain]) - [each.height for each in made.truth]
+    assert np.sqrt(np.mean(np.square(error))) < 0.17
+
+
+SECOND = 10**9
+START = 10**6
+CONFIG = BathymetryConfig(sound_speed=1500.0, max_gap=2.0)
+
+
+def ping(seconds, **changes):
+    """Bins that are heard 0.01 s and 0.5 s after the ping, at 1500 m/s."""
+    values = {'range': [7.5, 375.0], 'iq': np.ones((2, 4), np.complex64)}
+    return Snapshot(stamp_ns=round((START + seconds) * SECOND), **{**values, **changes})
+
+
+def pose(seconds):
+    return Navigation(
+        stamp_ns=round((START + seconds) * SECOND),
+        position=(float(seconds), (seconds % 100.0) ** 2, 0.0),
+        orientation=(0.0, 0.0, 0.0, 1.0),
+        frame_id='odom',
+    )
+
+
+@pytest.fixture
+def queue():
+    """A queue that knows poses of every second from 0 to 40 s."""
+    queue = PoseQueue()
+    for second in range(41):
+        queue.add_pose(pose(second))
+    return queue
+
+
+def test_a_bin_is_heard_when_sound_has_gone_there_and_back():
+    delays = bin_stamps(ping(0.0), CONFIG) - START * SECOND
+    assert delays.tolist() == [0, SECOND // 100, SECOND // 2]
+    faster = bin_stamps(ping(0.0, sound_speed=1600.0), CONFIG) - START * SECOND
+    assert faster.tolist() == [0, 9_375_000, 468_750_000]
+
+
+def test_the_ship_is_where_it_was_when_each_bin_was_heard(queue):
+    queue.add_ping(ping(10.0))
+    queue.add_ping(ping(39.5))
+    first, last = (ping.posed for ping in queue.ready(CONFIG))
+    assert first.poses.position[:, 0] == pytest.approx([10.0, 10.01, 10.5])
+    assert first.poses.position[:, 1] == pytest.approx([100.0, 100.21, 110.5])  # 21 m/s
+    assert last.poses.position[:, 0] == pytest.approx([39.5, 39.51, 40.0])
+    assert first.frame_id == 'odom' and not len(queue)
+    queue.add_ping(ping(39.6))  # its last bin is heard after the last pose
+    assert queue.ready(CONFIG) == [] and len(queue) == 1
+    queue.add_pose(pose(41.0))
+    assert len(queue.ready(CONFIG)) == 1
+
+
+@pytest.mark.parametrize(
+    'seconds, altitude', [(9.0, None), (9.6, 30.0), (12.0, 31.0), (18.0, 32.0), (18.6, None)]
+)
+def test_the_newest_altitude_before_the_end_of_a_ping_counts_for_five_seconds(
+    queue, seconds, altitude
+):
+    for second, height in ((13.5, 32.0), (10.0, 30.0), (30.0, 50.0), (12.0, 31.0)):
+        stamp_ns = round((START + second) * SECOND)
+        queue.add_altitude(Altitude(stamp_ns=stamp_ns, altitude=height))
+    queue.add_ping(ping(seconds))
+    (ready,) = queue.ready(CONFIG)
+    assert ready.posed.altitude == altitude
+
+
+def test_what_waits_too_long_is_given_up_the_oldest_first_and_counted(queue):
+    for k in range(MOST_WAITING + 3):
+        queue.add_ping(ping(50.0 + 0.01 * k))
+    assert len(queue) == MOST_WAITING
+    assert queue.counts['navigation_missing'] == 3
+    for second in range(41, 60):
+        queue.add_pose(pose(second))
+    ready = queue.ready(CONFIG)
+    assert [each.snapshot.stamp_ns for each in (ready[0], ready[-1])] == [
+        ping(50.03).stamp_ns,
+        ping(52.02).stamp_ns,
+    ]
+
+
+def test_a_clock_that_was_set_back_takes_the_waiting_pings_with_it(queue):
+    queue.add_ping(ping(50.0))
+    queue.add_ping(ping(51.0))
+    for second in range(5):
+        queue.add_pose(pose(second - 500_000.0))
+    assert queue.counts['restarts'] == 1
+    assert queue.counts['navigation_gap'] == 2 and not len(queue)
+    queue.add_ping(ping(2.0 - 500_000.0))
+    assert len(queue.ready(CONFIG)) == 1

@@ -140,16 +140,12 @@ def test_existence_and_heights_of_the_prototype(monkeypatch):
     assert np.quantile(np.abs(np.concatenate(off)), 0.9) < 0.25
 
 
-@pytest.mark.parametrize(
-    'values',
-    [
-        {},
-        {'model_set': 'height_rw_ncs'},
-        {'model_set': 'angle_two_rw'},
-        {'model_set': 'height_two_rw'},
-    ],
-)
-def test_both_heights_of_a_step(values):
+SETS = ['terrain', 'height_rw_ncs', 'angle_two_rw', 'height_two_rw']
+
+
+@pytest.mark.parametrize('model_set', SETS)
+def test_both_heights_of_a_step(model_set):
+    values = {'model_set': model_set}
     snapshot = step()
     tracker, resolved = run(snapshot, **values)
     _, gated = run(snapshot, 'gated', **values)
@@ -239,12 +235,8 @@ def test_stretches_have_a_margin_and_are_cut_where_they_are_long():
     existence = np.zeros(10_000)
     existence[[100, 115, 400]] = 1.0
     existence[2000:9000] = 0.06
-    assert two.stretches(existence > two.POSSIBLE) == [
-        (90, 126),
-        (390, 411),
-        (1990, 5990),
-        (5990, 9010),
-    ]
+    cut = [(90, 126), (390, 411), (1990, 5990), (5990, 9010)]
+    assert two.stretches(existence > two.POSSIBLE) == cut
     assert two.stretches(np.zeros(50, bool)) == []
     assert two.stretches(np.ones(5, bool)) == [(0, 5)]
 
@@ -296,14 +288,7 @@ def test_surface_echoes_leave_layover_alone():
     assert not {*OF_GATED, *NEW} & set(run(floor(0.0), multipath=True)[1].extras)
 
 
-@pytest.mark.parametrize(
-    'staves, values',
-    [
-        (8, {}),
-        (8, {'model_set': 'height_two_rw'}),
-        (3, {}),
-    ],
-)
+@pytest.mark.parametrize('staves, values', [(8, {}), (8, {'model_set': 'height_two_rw'}), (3, {})])
 def test_a_gated_bin_is_marked_and_nothing_else_changes(staves, values):
     snapshot = step(P=staves)
     tracker, gated = run(snapshot, 'gated', **values)

@@ -6,17 +6,19 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The diver tracker on raw arrival times: echoes of a known transmitter, tags that emit alone."""
+"""The tracker on raw arrival times: echoes, tags that emit alone, instruments that are off."""
 
 from attrs import evolve
 from helpers.diver_runs import arrivals, errors, fix, run, SECOND
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics.arrivals_3d import BEARING, observe
 from sonar_imm.measurements import RelativeFix, VesselPose
+from sonar_imm.trackers.diver import estimate, offsets
 from sonar_imm.trackers.diver.instruments import Instruments, MOST_RECEIVERS
 from sonar_imm.trackers.diver.models import build_models
+from sonar_imm.trackers.diver.offsets import BiasTest, chi2_limit, RecentPairs
+from sonar_imm.trackers.diver.scan import ping_measurements
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate
 
@@ -25,17 +27,12 @@ from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simu
 def test_arrivals_are_better_than_fixes_made_of_them():
     squared = {'arrivals': [], 'multistatic_fixes': []}
     for sensor, found in squared.items():
+        changes = {'sensor': sensor, 'outlier_probability': 0.0, 'duration': 60.0}
         for seed in range(4):
-            scene = simulate(
-                scenario(
-                    'multistatic', {'sensor': sensor, 'outlier_probability': 0.0, 'duration': 60.0}
-                ),
-                seed,
-            )
+            scene = simulate(scenario('multistatic', changes), seed)
             tracker = DiverTracker(DiverConfig(max_tracks=1))
-            error, _ = errors(
-                run(tracker, [item.measurement for item in scene.measurements]), scene.truth[0]
-            )
+            made = run(tracker, [item.measurement for item in scene.measurements])
+            error, _ = errors(made, scene.truth[0])
             found += np.sum(error**2, axis=1).tolist()
     rmse = {sensor: np.sqrt(np.mean(found)) for sensor, found in squared.items()}
     assert rmse['arrivals'] < rmse['multistatic_fixes']
@@ -45,12 +42,8 @@ def test_arrivals_are_better_than_fixes_made_of_them():
 def tag_ping(second, position, rng, receivers=RECEIVERS, emitted=0.123, std=1e-4):
     distance = np.linalg.norm(np.append(position, 0.0) - receivers, axis=1)
     n = len(receivers)
-    return arrivals(
-        round(second * SECOND),
-        receivers,
-        emitted + distance / 1500.0 + std * rng.normal(size=n),
-        var_toa=std**2,
-    )
+    toa = emitted + distance / 1500.0 + std * rng.normal(size=n)
+    return arrivals(round(second * SECOND), receivers, toa, var_toa=std**2)
 
 
 def test_a_tag_of_unknown_emission_time_is_followed_also_by_two_receivers():
@@ -94,9 +87,7 @@ def many_receivers(
             path / 1500.0,
             tx=tx,
             var_toa=(0.15 / 1500.0) ** 2 / scale,
-            bearing=none
-            if elevation or scale != 1.0
-            else np.mod(bearing + np.pi, 2 * np.pi) - np.pi,
+            bearing=none if elevation or scale != 1.0 else (bearing + np.pi) % (2 * np.pi) - np.pi,
             var_bearing=0.02**2,
             elevation=up if elevation else none,
             var_elevation=np.full(8, 0.02**2),
@@ -264,14 +255,6 @@ def test_a_vessel_that_moves_tells_how_its_transceiver_is_turned():
     assert miss @ np.linalg.solve(considered.covariance[0, :2, :2], miss) < 6.0
 
 
-def test_a_bearing_of_an_arrival_has_the_error_of_its_receiver():
-    x, nowhere = np.array([[3.0], [4.0], [0.05]]), np.zeros((1, 3))
-    columns = np.array([[0, 1, -1, -1, 2, -1, -1]])
-    value, gradient = observe(x, 0.0, np.array([BEARING]), columns, nowhere, nowhere)
-    assert value[0, 0] == pytest.approx(np.arctan2(4.0, 3.0) + 0.05)
-    np.testing.assert_allclose(gradient[0, :, 0], [-4.0 / 25.0, 3.0 / 25.0, 1.0])
-
-
 def test_a_sonar_of_range_and_bearing_states_what_its_mount_does():
     """One receiver at the transmitter: what it hears is a range and a bearing."""
     place, here = np.array([30.0, 40.0, 0.0]), np.zeros((1, 3))
@@ -324,3 +307,196 @@ def test_the_place_of_a_sensor_is_part_of_what_a_fix_is():
     plain = fix(1.0, 3.0, 4.0)
     placed = evolve(plain, seen_from=np.zeros(2))
     assert plain.key() != placed.key() and plain.key() == evolve(plain).key()
+
+
+TOA_STD, SPEED = 2e-4, 1500.0
+EVERY = 'every'
+
+
+def legs(place, tag=False):
+    reach = np.linalg.norm(RECEIVERS - [*place, 0.0], axis=1)
+    return reach if tag else reach + np.hypot(*place)
+
+
+def ping_of(place, tag=False, error=0.0, rows=slice(None)):
+    """The arrivals of a diver at `place` (2,) at the receivers `rows`, with errors (4,), m."""
+    toa = (legs(place, tag) + error)[rows] / SPEED
+    known = {
+        'rx_id': np.arange(4)[rows],
+        'tx': [np.nan if tag else 0.0] * 3,
+        'var_toa': TOA_STD**2,
+    }
+    return arrivals(1, RECEIVERS[rows], toa, tx_id=np.ones(len(toa)), **known)
+
+
+def evidence(places, received, errors, tag=False, **stated):
+    """The evidence of pings of a diver at `places` (k, 2) whose arrivals, those that were `heard`
+    (k, 4), have the errors (k, 4), m of path."""
+    config = DiverConfig(**stated)
+    models, found = build_models(config), BiasTest()
+    layout = Instruments().layout(config, models)
+    for place, rows, error in zip(places, received, errors):
+        ping = ping_of(place, tag, error, rows)
+        seen = ping_measurements(ping, np.arange(len(ping)), config, models, layout)
+        ids = np.column_stack([ping.tx_id, ping.rx_id]).astype(np.int64)
+        found = found.with_ping(seen, seen.echo, ids, place + [0.3, -0.2], config)
+    return found, config
+
+
+def scene(pings=60, seed=1):
+    """A diver who jumps as nobody can: places, which arrivals were heard, and their noise, m."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-40.0, 60.0, (pings, 2))
+    received = rng.uniform(size=(pings, 4)) < 0.9
+    return places, received, SPEED * TOA_STD * rng.normal(size=(pings, 4))
+
+
+@pytest.mark.parametrize('tag', [False, True])
+def test_the_evidence_is_what_least_squares_gains_by_an_error_of_each_pair(tag, monkeypatch):
+    monkeypatch.setattr(offsets, 'MEMORY', 1e12)
+    monkeypatch.setattr(offsets, 'CAPPED', 1e12)
+    places, received, noise = scene()
+    errors = noise + np.array([0.0, 0.8, -0.5, 0.3])
+    found, config = evidence(places, received, errors, tag)
+    # All unknowns at once: k of each ping and four errors.
+    k, rows, residual = 3 if tag else 2, [], []
+    for at, (place, seen, error) in enumerate(zip(places, received, errors)):
+        if seen.sum() <= k:
+            continue
+        slope = [(legs(place + d, tag) - legs(place - d, tag)) / 2e-3 for d in 1e-3 * np.eye(2)]
+        slope += [np.ones(4)] if tag else []
+        for r in np.flatnonzero(seen):
+            row = np.zeros(len(places) * k + 4)
+            row[k * at : k * at + k] = [part[r] for part in slope]
+            row[len(places) * k + r] = 1.0
+            rows.append(row)
+            residual.append(error[r])
+    A, y = np.array(rows) / (SPEED * TOA_STD), np.array(residual) / (SPEED * TOA_STD)
+
+    def left(part):
+        return np.sum((y - part @ np.linalg.lstsq(part, y, rcond=None)[0]) ** 2)
+
+    gain = left(A[:, :-4]) - left(A)
+    value, rank = found.evidence(config)[EVERY]
+    scatter = max((found.square - gain) / (found.freedom - rank), 1.0)
+    assert value * scatter == pytest.approx(gain, rel=0.1)
+    assert value > chi2_limit(rank)
+
+
+def test_noise_alone_is_no_evidence_even_where_more_of_it_than_stated():
+    for seed in range(5):
+        places, received, noise = scene(seed=seed)
+        for times in (1.0, 3.0):
+            found, config = evidence(places, received, times * noise)
+            assert found.warnings(config) == []
+
+
+def test_what_is_stated_of_instruments_is_expected_and_no_more():
+    places, received, noise = scene()
+    late = noise + np.array([0.0, 0.8, -0.5, 0.3])
+    found, config = evidence(places, received, late)
+    (warning,) = found.warnings(config)
+    assert 'receiver_clock_std' in warning and 'target_z' in warning
+    assert found.warnings(DiverConfig(receiver_clock_std=5e-4)) == []
+    assert found.warnings(DiverConfig(receiver_position_std=0.7)) == []
+    assert found.warnings(DiverConfig(receiver_clock_std=1e-5)) != []
+
+
+def test_a_single_cause_that_explains_it_all_is_named():
+    places, received, noise = scene()
+    deep = np.array([np.linalg.norm(RECEIVERS - [*p, -10.0], axis=1) for p in places])
+    deep += np.hypot(np.hypot(*places.T), 10.0)[:, None] - np.array([legs(p) for p in places])
+    found, config = evidence(places, received, noise + deep)
+    assert 'Likely cause: target_z (or dimensions: 3)' in found.warnings(config)[0]
+    slow = 0.01 * np.array([legs(place) for place in places])
+    found, config = evidence(places, received, noise + slow)
+    assert 'Likely cause: sound_speed' in found.warnings(config)[0]
+    assert found.warnings(DiverConfig(sound_speed_std=15.0)) == []
+
+
+def test_pings_that_any_place_explains_say_nothing():
+    places, received, noise = scene()
+    received[:, 2:] = False
+    found, config = evidence(places, received, noise + 1.0)
+    assert found.freedom == 0.0 and found.warnings(config) == []
+
+
+def heard(config, place, tag=False):
+    """The pairs heard in one ping, all of whose echoes were taken, of a diver at `place` (2,)."""
+    models, everyone = build_models(config), np.ones(4, bool)
+    ping, layout = ping_of(place, tag), Instruments().layout(config, models)
+    seen = ping_measurements(ping, np.arange(4), config, models, layout)
+    at = np.asarray(place, float)
+    nothing = BiasTest(), RecentPairs()
+    return offsets.accumulate_residuals(*nothing, {0: at}, {0: everyone}, ping, seen, config)[1]
+
+
+def placed(path, guess, receivers, tag):
+    """Where path lengths (4,) put a diver, by least squares with these receivers (4, 3)."""
+    x = np.array([*guess, 0.0] if tag else guess, float)
+
+    def expected(at):
+        reach = np.linalg.norm(receivers - [*at[:2], 0.0], axis=1)
+        return reach + (at[2] if tag else np.hypot(*at[:2]))
+
+    for _ in range(6):
+        H = np.stack([(expected(x + d) - expected(x - d)) / 2e-4 for d in 1e-4 * np.eye(len(x))])
+        x = x + np.linalg.lstsq(H.T, path - expected(x), rcond=None)[0]
+    return x[:2]
+
+
+@pytest.mark.parametrize('tag', [False, True])
+def test_what_is_assumed_of_instruments_moves_the_place_of_a_ping_as_it_says(tag):
+    """Against draws of receivers, clocks and sound speeds, and least squares of each."""
+    config, place = DiverConfig(), np.array([20.0, 30.0])
+    mean, nothing = np.array([[*place, 0.0, 0.0]]), np.zeros((1, 4, 4))
+    wide = offsets.with_assumed_errors(heard(config, place, tag), mean, nothing, config)
+    rng, found = np.random.default_rng(2), []
+    off, late, slow = offsets.ASSUMED.values()
+    for _ in range(1500):
+        moved = RECEIVERS.copy()
+        moved[0 if tag else 1 :, :2] += off * rng.normal(size=(4 if tag else 3, 2))
+        reach = np.linalg.norm(moved - [*place, 0.0], axis=1)
+        path = (reach + (0.0 if tag else np.hypot(*place))) * (1.0 - slow / SPEED * rng.normal())
+        found.append(placed(path + late * SPEED * rng.normal(size=4), place, RECEIVERS, tag))
+    np.testing.assert_allclose(wide[0, :2, :2], np.cov(np.array(found).T), rtol=0.15, atol=0.01)
+    assert (wide[0, 2:] == 0.0).all()
+
+
+def test_nothing_is_assumed_where_something_is_stated_or_nobody_was_heard():
+    mean, nothing = np.array([[20.0, 30.0, 0.0, 0.0]]), np.zeros((1, 4, 4))
+    config = DiverConfig()
+    found = heard(config, mean[0, :2])
+    assert offsets.with_assumed_errors(RecentPairs(), mean, nothing, config) is nothing
+    exact = DiverConfig(systematic_errors='exact')
+    assert offsets.with_assumed_errors(found, mean, nothing, exact) is nothing
+    for name in offsets.STDS:
+        stated = DiverConfig(**{name: 1e-6})
+        assert offsets.with_assumed_errors(found, mean, nothing, stated) is nothing
+
+
+def test_what_is_assumed_moves_no_estimate_and_ends_with_fixes():
+    made = simulate(scenario('multistatic', {'duration': 20.0}), 1)
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    assumed = run(tracker, (item.measurement for item in made.measurements))[-1]
+    mean, inside = estimate.published_state(tracker._stream.state, tracker.models, 0.05)
+    np.testing.assert_array_equal(assumed.state, mean)
+    ratio = np.diag(assumed.covariance[0])[:2] / np.diag(inside[0])[:2]
+    assert (ratio > 1.5).all() and (ratio < 30.0).all()
+    last = made.measurements[-1].measurement.stamp_ns * 1e-9
+    after = tracker.process(fix(last + 1.0, *mean[0, :2]))[-1]
+    inside = estimate.published_state(tracker._stream.state, tracker.models, 0.05)[1]
+    np.testing.assert_array_equal(after.covariance, inside)
+
+
+def test_pairs_that_fell_silent_are_forgotten():
+    config, place = DiverConfig(), np.array([20.0, 30.0])
+    found = heard(config, place)
+    nobody = found
+    for _ in range(offsets.RECENT):
+        nobody = nobody._replace(age=nobody.age + 1.0)
+    models = build_models(config)
+    layout = Instruments().layout(config, models)
+    seen = ping_measurements(ping_of(place, rows=[2]), np.arange(1), config, models, layout)
+    left = nobody.with_ping(seen, np.ones(1, bool), np.array([[1, 2]]))
+    assert left.pairs == ((1, 2),) and len(found.pairs) == 4

@@ -7,19 +7,21 @@
 # language governing permissions and limitations under the License.
 
 
-"""Bursts: the vectors of an independent prototype, and what users see of fixes that are off."""
+"""Fixes that are off for a while, in two groups, or in turns: followed as they are, and said."""
 
 from pathlib import Path
 
 from attrs import evolve
-from helpers.diver_runs import fix, SECOND
+from helpers.diver_runs import fix, run, scan_of
 import numpy as np
 import pytest
 
+from benchmarks.diver_field import fixes_of, SINGLE
 from sonar_imm.estimation import bank
-from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver import bursts
+from sonar_imm.trackers.diver.disagreement import two_places
 from sonar_imm.trackers.diver.models import build_models
+from sonar_imm.trackers.diver.polling import BEFORE, MOST_FIXES, turn_of
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
@@ -52,12 +54,8 @@ def assert_states(models, blocks, x, P, mask, skip=()):
 
 def test_an_offset_is_mixed_and_predicted_as_by_the_prototype(models):
     with np.load(VECTORS / 'offset_mix.npz') as v:
-        law = evolve(
-            models.bank,
-            speed=float(v['speed_mean']),
-            speed_variance=float(v['speed_var']),
-            sector=float(v['sigma2']),
-        )
+        speed = {'speed': float(v['speed_mean']), 'speed_variance': float(v['speed_var'])}
+        law = evolve(models.bank, sector=float(v['sigma2']), **speed)
         blocks = models.to_blocks(v['x'][None], v['P'][None])
         mixed, c = bank.mix(law, blocks, v['mu'][None], v['transition'][None], bursts.TAIL)
         np.testing.assert_allclose(c[0], v['mixed_mu'], atol=1e-12)
@@ -204,9 +202,7 @@ def scans(truth, seed, std=0.7, false=2, half=50.0):
         seen = places[np.isfinite(places[:, 0]) & (rng.uniform(size=len(places)) < 0.95)]
         z = seen + std * rng.normal(size=seen.shape)
         z = np.concatenate([z, rng.uniform(-half, half, (rng.poisson(false), 2))])
-        covariance = np.tile(std**2 * np.eye(2), (len(z), 1, 1))
-        position = np.column_stack([z, np.zeros(len(z))])
-        yield Fixes(stamp_ns=k * SECOND, position=position, covariance=covariance, frame_id='map')
+        yield scan_of(k, z, std)
 
 
 def confirmed(estimate):
@@ -304,3 +300,181 @@ def test_clean_fixes_are_not_doubted():
         np.testing.assert_allclose(a.state, b.state, atol=1e-2)
         np.testing.assert_allclose(a.covariance, b.covariance, atol=1e-2)
     assert with_bursts.warnings() == without.warnings() == []
+
+
+def way(t):
+    return np.array([20.0 * np.cos(0.03 * t), 20.0 * np.sin(0.03 * t)])
+
+
+def fixes_in_turn(count, offset, std, second=lambda k: k % 2 == 1, seed=0):
+    """Fixes of a diver, one a second; `second` tells which are `offset` off."""
+    rng = np.random.default_rng(seed)
+    for k in range(count):
+        place = way(float(k)) + std * rng.normal(size=2)
+        if second(k):
+            place = place + offset
+        yield fix(1.0 + k, *place, std**2 * np.eye(2))
+
+
+def followed(items, **settings):
+    """NEES (n,) of the position from the thirtieth fix on, the estimates and the tracker."""
+    tracker = DiverTracker(DiverConfig(max_tracks=1, **settings))
+    made = [tracker.process(item)[-1] for item in items]
+    nees = []
+    for k, each in enumerate(made[30:], start=30):
+        error = each.state[0, :2] - way(float(k))
+        nees.append(error @ np.linalg.solve(each.covariance[0, :2, :2], error))
+    return np.array(nees), made, tracker
+
+
+@pytest.mark.parametrize(
+    'offset, std, settings',
+    [
+        ((6.0, 8.0), 0.3, {}),
+        ((1.8, 2.4), 0.3, {}),
+        ((-6.0, 0.0), 1.0, {'association': 'gnn'}),
+        ((60.0, 80.0), 1.0, {}),
+    ],
+    ids=['10 m', '3 m', '6 m', '100 m'],
+)
+def test_both_places_are_held_and_said(offset, std, settings):
+    nees, made, tracker = followed(fixes_in_turn(90, offset, std), **settings)
+    assert nees.mean() < 3.0 and np.mean(nees < 5.99) > 0.85
+    # The ellipse is long along the offset only.
+    far, P = np.hypot(*offset), made[-1].covariance[0, :2, :2]
+    along = np.array(offset) / far
+    across = np.array([-along[1], along[0]])
+    assert np.sqrt(along @ P @ along) == pytest.approx(0.5 * far, rel=0.2)
+    assert across @ P @ across < std**2
+    (sentence,) = tracker.warnings()
+    assert sentence.startswith('fixes fall in two groups') and 'two sensors' in sentence
+    said = [float(word) for word in sentence.replace('(', ' ').split() if _is_number(word)]
+    assert said[0] == pytest.approx(far, rel=0.1)
+    assert {tuple(each.extras['track_id']) for each in made[30:]} == {(1,)}
+
+
+def _is_number(word):
+    return word.replace('.', '').replace('-', '').replace('e+', '').isdigit()
+
+
+def test_a_place_without_fixes_is_given_up():
+    stops = 50
+    items = fixes_in_turn(100, (0.0, 8.0), 0.5, lambda k: k % 2 == 1 and k < stops)
+    _, made, tracker = followed(items)
+    assert made[stops - 1].covariance[0, 1, 1] > 9.0
+    assert made[-1].covariance[0, 1, 1] < 1.0
+    assert np.hypot(*(made[-1].state[0, :2] - way(99.0))) < 1.5
+    assert not tracker.warnings()
+
+
+@pytest.mark.parametrize(
+    'scene, seed, due',
+    [
+        # A row with an offset and hardly any weight is there first.
+        ('diver, unnamed, 10 m', 701, 'two groups'),
+        ('diver, b 3 m off', 602, '3 m apart'),
+        ('rov, b 3 m off', 600, '3 m apart'),
+        ('boat, b 2 s late', 600, '2 s late'),
+        ('boat, two sensors', 600, ''),
+    ],
+)
+def test_an_offset_or_a_delay_is_said_and_nothing_else(scene, seed, due):
+    items, truth = fixes_of(SINGLE[scene], seed)
+    tracker, nees = DiverTracker(DiverConfig(target=SINGLE[scene].target, max_tracks=1)), []
+    for item, place in zip(items[:140], truth):
+        last = tracker.process(item)[-1]
+        if len(last.state):
+            error = last.state[0, :2] - place
+            nees.append(error @ np.linalg.solve(last.covariance[0, :2, :2], error))
+    assert np.mean(nees[50:]) < 4.0
+    said = tracker.warnings()
+    assert len(said) == bool(due) and all(due in text for text in said)
+    # Scales that stood for the offset at first are left.
+    rows = tracker._stream.state.rows
+    assert (rows.key['scale'][rows.logw.argmax(), :2] <= 1.0).all()
+
+
+def test_one_place_is_not_two():
+    rng = np.random.default_rng(0)
+    v = rng.normal(size=(4, 16, 2))
+    v[1, ::2] += [8.0, 6.0]  # in turns
+    v[2, 8:] += [8.0, 6.0]  # it moved
+    v[3, ::5] += 30.0 * rng.normal(size=(4, 2))  # outliers
+    distance, std = two_places(v)
+    assert distance[1] == pytest.approx(10.0, abs=1.0) and std[1] < 2.0
+    assert (distance[[0, 2, 3]] < 4.5 * std[[0, 2, 3]]).all()
+    v[1, 0] = np.nan
+    assert two_places(v)[0][1] == 0.0
+
+
+SETTINGS = {'directions': 4, 'covariance_scales': (1.0,)}
+
+
+def in_turn(paths, rate, missing=0.1, std=0.3, count=120, seed=0):
+    """Fixes of targets one after the other; paths: (place at a time) of each."""
+    rng = np.random.default_rng(seed)
+    for k in range(count):
+        when = 5.0 + k / rate
+        place = paths[k % len(paths)](when) + std * rng.normal(size=2)
+        if rng.uniform() > missing:
+            yield fix(when, *place, std**2 * np.eye(2))
+
+
+def circle(t, phase, x=0.0):
+    return np.array([x + 8.0 * np.cos(t / 12 + phase), 8.0 * np.sin(t / 12 + phase)])
+
+
+def said(items, **settings):
+    tracker = DiverTracker(DiverConfig(**SETTINGS, **settings))
+    run(tracker, list(items))
+    return tracker, tracker.warnings()
+
+
+@pytest.mark.parametrize('targets, rate', [(4, 4.0), (3, 1.0), (2, 0.5)])
+def test_the_advice_once_followed_ends_the_sentence(targets, rate):
+    paths = [lambda t, k=k: circle(t, 1.6 * k, 30.0 * k) for k in range(targets)]
+    items = list(in_turn(paths, rate))
+    tracker, sentences = said(items)
+    (sentence,) = sentences  # of tracks that starve, the fixes tell nothing else
+    period = targets / rate
+    assert f'Set scan_period to {period:.3g}' in sentence and 'covariance' not in sentence
+    assert len(tracker._stream.state.memory['single'].stamps) <= MOST_FIXES
+    assert not any('scan_period' in text for text in said(items, scan_period=period)[1])
+    assert not any('scan_period' in text for text in said(items, scan_period=-1.0)[1])
+
+
+def test_names_scans_and_single_targets_are_not_polled():
+    one = list(in_turn([lambda t: circle(t, 0.0)], 1.0))
+    paths = [lambda t, k=k: circle(t, 1.6 * k, 12.0 * k) for k in range(3)]
+    named = [evolve(item, target_id=k % 3) for k, item in enumerate(in_turn(paths, 3.0, 0.0))]
+    together = [fix(5.0 + k, *circle(k, 2.0 * d)) for k in range(100) for d in range(2)]
+    for items in (one, named, together):
+        assert not any('scan_period' in text for text in said(items)[1])
+
+
+@pytest.mark.parametrize('missing', [0.0, 0.1])
+@pytest.mark.parametrize('offset', [6.0, 30.0])
+def test_two_at_a_constant_offset_are_two_targets_or_two_sensors(offset, missing):
+    """They take turns as two targets would: which it is cannot be known, so both are said."""
+    paths = [lambda t: circle(t, 0.0), lambda t: circle(t, 0.0) + (offset, 1.0)]
+    (sentence,) = said(in_turn(paths, 1.0, missing))[1]
+    assert 'two groups of fixes' in sentence and 'offset' in sentence
+    assert 'set scan_period to 2' in sentence and 'covariance' not in sentence
+    far = float(sentence.partition(' m apart')[0].split()[-1])
+    assert far == pytest.approx(np.hypot(offset, 1.0), abs=0.5)
+
+
+@pytest.mark.parametrize('offset, std', [(3.0, 1.0), (6.0, 0.5)])
+def test_a_constant_offset_is_no_second_target_in_any_stretch(offset, std):
+    t, rng = np.arange(300.0), np.random.default_rng(4)
+    way = np.column_stack([25.0 * np.sin(t / 50.0) + 0.1 * t, 15.0 * np.cos(t / 35.0)])
+    places = way + np.outer(t % 2, (offset, 0.0)) + std * rng.normal(size=way.shape)
+    stamps = (t * 1e9).astype(np.int64)
+    for end in range(2 * BEFORE, 300, 10):
+        last = slice(max(0, end - MOST_FIXES), end)
+        turn = turn_of(stamps[last], places[last])
+        assert turn is None or turn.offset == pytest.approx(offset, abs=1.0)
+    # A second target goes his own way.
+    other = places + np.outer(t % 2, (8.0, 0.15)) * np.column_stack([np.ones(300), t])
+    turn = turn_of(stamps[:MOST_FIXES], other[:MOST_FIXES])
+    assert turn.seconds == pytest.approx(2.0) and turn.offset is None

@@ -263,9 +263,6 @@ def test_latitude_and_longitude_and_what_a_transceiver_sees_bring_their_heights(
     assert relative.covariance[0, Z, Z] < 2.0
 
 
-# -- copies --------------------------------------------------------------------------------------
-
-
 def banked(means, variances, weights, **settings):
     """One diver whose rows have these z, and its models."""
     config = DiverConfig(dimensions=3, model_set='heading_speed', **settings)

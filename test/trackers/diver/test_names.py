@@ -6,28 +6,27 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Names: of fixes, of tags' pings, of divers that are also seen without one."""
+"""Names of fixes and tags, sensors with numbers of their own, and tracks begun by a start."""
+
+import itertools
 
 from attrs import evolve
-from helpers.diver_runs import arrivals, fix, scan_of
+from helpers.diver_runs import arrivals, fix, scan
 import numpy as np
 import pytest
 
-from sonar_imm.measurements import Fix, NOBODY
+from sonar_imm.measurements import Fix, NOBODY, Start
 from sonar_imm.trackers.diver.names import scans_to_merge
+from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
 SECOND = 10**9
 BOTH = ('gnn', 'jipda')
-RX = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
 
 
 def named(second, place, name):
     return evolve(fix(second, *place), target_id=name)
-
-
-def scan(second, *places, **values):
-    return scan_of(second, places, **values)
 
 
 def test_scans_needed_before_two_tracks_are_one_follow_from_p_d():
@@ -94,19 +93,16 @@ def test_names_without_a_track_are_not_kept():
     assert len(tracker._stream.state.memory['last_named']) < 100
 
 
-# -- tags ----------------------------------------------------------------------------------------
-
-
 def ping(second, places, rng=None):
     """A message with a tag's arrivals for each number in `places`."""
     tx_id, rx_id, toa, rx = [], [], [], []
     for number, place in places.items():
-        leg = np.linalg.norm(RX - [*place, 0.0], axis=1) / 1500.0
+        leg = np.linalg.norm(RECEIVERS - [*place, 0.0], axis=1) / 1500.0
         noise = 0.0 if rng is None else 1e-4 * rng.normal(size=4)
         toa += (leg - leg.min() + 0.01 + noise).tolist()
         tx_id += [number] * 4
         rx_id += range(4)
-        rx += RX.tolist()
+        rx += RECEIVERS.tolist()
     return arrivals(round(second * SECOND), rx, toa, tx_id=tx_id, rx_id=rx_id)
 
 
@@ -137,9 +133,6 @@ def test_a_tag_without_a_number_is_as_before():
     assert len(estimate) == 1
 
 
-# -- sensors -------------------------------------------------------------------------------------
-
-
 def test_sensors_have_numbers_of_their_own():
     stated = {
         'sensors': ['radar', 'lidar'], 'radar.fix_std': 4, 'lidar.fix_std': 0.5,
@@ -163,13 +156,8 @@ def test_sensors_have_numbers_of_their_own():
 
 
 def test_the_detection_probability_of_a_sensor_decides_how_soon_existence_fades():
-    config = DiverConfig.from_mapping(
-        {
-            'sensors': ['weak', 'strong'],
-            'weak.detection_probability': 0.2,
-            'strong.detection_probability': 0.95,
-        }
-    )
+    stated = {'weak.detection_probability': 0.2, 'strong.detection_probability': 0.95}
+    config = DiverConfig.from_mapping({'sensors': ['weak', 'strong'], **stated})
     existence = {}
     for sensor in config.sensors:
         tracker = DiverTracker(config)
@@ -181,22 +169,6 @@ def test_the_detection_probability_of_a_sensor_decides_how_soon_existence_fades(
     assert not existence['strong'] or existence['strong'][0] < existence['weak'][0]
 
 
-@pytest.mark.parametrize(
-    'values, words',
-    [
-        ({'sensors': ['a'], 'a.fix_std': -1.0}, "'a.fix_std' must be between"),
-        ({'sensors': ['a'], 'b.fix_std': 1.0}, "unknown parameter 'b.fix_std'"),
-        ({'sensors': ['a'], 'a.max_tracks': 1}, "unknown parameter 'a.max_tracks'"),
-        ({'sensors': 5, 'a.fix_std': 1.0}, "'sensors' must be a list"),
-        ({'tags': ('a/b',)}, "'a/b' cannot be part of a topic"),
-        ({'transceiver_lever': (1.0,)}, 'needs three values'),
-    ],
-)
-def test_lists_that_do_not_fit_are_named(values, words):
-    with pytest.raises(ValueError, match=words.replace('(', r'\(')):
-        DiverConfig.from_mapping(values)
-
-
 def test_what_a_sensor_has_of_its_own_changes_as_what_all_have():
     """`fix_std` may change while a tracker runs, `coverage_file` may not."""
     config = {'sensors': ['a'], 'a.fix_std': 4.0}
@@ -205,3 +177,123 @@ def test_what_a_sensor_has_of_its_own_changes_as_what_all_have():
     assert tracker.config.of_sensor('a').fix_std == 2.0
     with pytest.raises(ValueError, match='coverage_file'):
         tracker.reconfigure(DiverConfig.from_mapping({**config, 'a.coverage_file': 'x.csv'}))
+
+
+CONFIRMED, COASTING = 1, 2
+
+
+def start(second, x, y=0.0, sigma=1.0):
+    return Start(
+        stamp_ns=round(second * SECOND),
+        position=[x, y, 0.0],
+        covariance=np.eye(2) * sigma**2,
+        frame_id='map',
+    )
+
+
+def named_fix(second, x, y=0.0, name=NOBODY):
+    return evolve(fix(second, x, y, 0.04 * np.eye(2)), target_id=name)
+
+
+def run(measurements, **options):
+    tracker = DiverTracker(DiverConfig(**options))
+    newest = [tracker.process(item)[-1] for item in measurements][-1]
+    return tracker, newest
+
+
+@pytest.mark.parametrize(
+    'options',
+    [{}, {'association': 'jipda'}, {'association': 'gnn'}, {'dimensions': 3}, {'max_tracks': 1}],
+)
+def test_a_track_begins_confirmed_at_the_place_and_follows_the_fixes_after_it(options):
+    tracker, first = run([start(1, 5.0, 7.0, sigma=2.0)], **options)
+    assert first.extras['track_state'].tolist() == [CONFIRMED]
+    assert first.xyz[0, :2] == pytest.approx([5.0, 7.0])
+    assert first.covariance[0, :2, :2] == pytest.approx(np.eye(2) * 4.0)
+    for second in range(2, 12):
+        last = tracker.process(named_fix(second, 5.0 + 0.5 * second, 7.0))[-1]
+    assert last.extras['track_id'].tolist() == [1]  # the start's own: no fix began another
+    assert last.xyz[0, :2] == pytest.approx([10.5, 7.0], abs=0.5)
+
+
+def test_without_a_start_the_same_fix_makes_a_tentative_track():
+    _, first = run([named_fix(1, 5.0, 7.0)])
+    assert first.extras['track_state'].tolist() == [0]
+
+
+def test_the_track_that_is_there_gives_way_and_others_stay():
+    walk = [named_fix(k, x) for k in range(1, 8) for x in (0.0, 50.0)]
+    _, before = run(walk)
+    _, after = run([*walk, start(7.5, 0.3)])
+    assert before.extras['track_id'].tolist() == [1, 2]
+    assert after.extras['track_id'].tolist() == [2, 3]
+    assert after.xyz[:, 0] == pytest.approx([50.0, 0.3], abs=0.1)
+
+
+def test_with_one_diver_the_start_is_where_it_is_however_far():
+    walk = [named_fix(k, 0.0) for k in range(1, 8)]
+    _, after = run([*walk, start(7.5, 300.0)], max_tracks=1)
+    assert after.extras['track_id'].tolist() == [2]
+    assert after.xyz[0, 0] == pytest.approx(300.0, abs=1e-9)
+    _, several = run([*walk, start(7.5, 300.0)])
+    assert several.extras['track_id'].tolist() == [1, 2]
+
+
+def test_a_diver_that_has_a_name_keeps_its_track():
+    walk = [named_fix(k, 0.0, name=4) for k in range(1, 8)]
+    _, after = run([*walk, start(7.5, 0.1)])
+    assert after.extras['target_id'].tolist() == [4, NOBODY]
+
+
+def test_too_many_are_counted_and_said():
+    tracker, last = run([start(1 + 0.1 * k, 100.0 * k) for k in range(5)], max_tracks=3)
+    assert last.extras['track_id'].tolist() == [1, 2, 3]
+    assert tracker.health()['not_started'] == 2
+    assert tracker.warnings() == [
+        '2 starts ignored: max_tracks (3) tracks are confirmed. Increase max_tracks'
+    ]
+
+
+def test_names_without_end_are_counted_and_said():
+    """Each fix has a name of its own: a driver that numbers its fixes, not its targets."""
+    tracker, last = run(
+        [named_fix(1 + 0.01 * k, 100.0 * k, name=k + 1) for k in range(30)], max_tracks=3
+    )
+    assert len(last) == 25
+    assert tracker.health()['names_without_track'] == 5
+    (sentence,) = tracker.warnings()
+    assert sentence.startswith('5 positions with a name of their own started no track')
+
+
+def test_a_start_is_no_missed_detection():
+    walk = [named_fix(k, 0.0) for k in range(1, 8)]
+    _, after = run([*walk, *(start(7.5 + 0.01 * k, 500.0 + 50.0 * k) for k in range(12))])
+    assert after.extras['track_state'][0] == CONFIRMED
+
+
+def test_the_order_of_arrival_changes_nothing():
+    items = [
+        named_fix(1, 0.0),
+        named_fix(2, 0.2),
+        start(2, 30.0),
+        start(2.5, 0.5),
+        named_fix(3, 0.4),
+        named_fix(3, 30.1),
+    ]
+    _, expected = run(items)
+    for order in itertools.islice(itertools.permutations(items), 0, 720, 79):
+        tracker = DiverTracker(DiverConfig())
+        for item in order:
+            last = tracker.process(item)[-1]
+        if last.stamp_ns == 3 * SECOND:
+            assert (last.state == expected.state).all()
+            assert last.extras['track_id'].tolist() == expected.extras['track_id'].tolist()
+
+
+def test_a_start_may_stand_in_a_smoothed_run():
+    smoother = SmoothingDiverTracker(DiverConfig())
+    for item in [start(1, 0.0), *(named_fix(k, 0.5 * k) for k in range(2, 9)), start(9, 60.0)]:
+        smoother.process(item)
+    made = list(smoother.smoothed())
+    assert [len(item) for item in made] == [1] * 8 + [2]
+    assert all(np.isfinite(item.state).all() for item in made)

@@ -9,7 +9,7 @@
 """Latitude and longitude, and positions relative to a vessel, as the tracker places them."""
 
 from attrs import evolve
-from helpers.diver_runs import run, SECOND
+from helpers.diver_runs import fix, run, SECOND
 import numpy as np
 import pymap3d
 import pytest
@@ -50,9 +50,6 @@ def relative(second, offset, **values):
     return RelativeFix(stamp_ns=round(second * SECOND), offset=offset, **values)
 
 
-# -- latitude and longitude ----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize('away', [1e3, 1e5])
 def test_positions_on_earth_give_the_track_of_the_same_positions_in_metres(away):
     """Also 100 km from the origin, where its plane is 785 m above the ellipsoid."""
@@ -62,13 +59,8 @@ def test_positions_on_earth_give_the_track_of_the_same_positions_in_metres(away)
     ups = [ORIGIN.local(*place)[2] for place in places]
     whole = [(*p[:2], up) for p, up in zip(path, ups)]
     on_earth = run(DiverTracker(config), [geodetic(k + 1, p) for k, p in enumerate(whole)])
-    metres = run(
-        DiverTracker(config),
-        [
-            Fix(stamp_ns=(k + 1) * SECOND, position=p, covariance=0.04 * np.eye(2), frame_id='map')
-            for k, p in enumerate(path)
-        ],
-    )
+    flat = [fix(k + 1, *p[:2], 0.04 * np.eye(2)) for k, p in enumerate(path)]
+    metres = run(DiverTracker(config), flat)
     assert on_earth[-1].frame_id == 'map'
     assert on_earth[-1].state == pytest.approx(metres[-1].state, abs=1e-6)
     assert on_earth[-1].covariance == pytest.approx(metres[-1].covariance, rel=1e-3)
@@ -82,31 +74,29 @@ def test_the_first_position_is_the_origin_unless_one_is_stated_and_reset_forgets
     tracker = DiverTracker(DiverConfig())
     assert tracker.origin is None
     estimates = run(tracker, [geodetic(k, (300.0, 40.0, 0.0)) for k in range(1, 5)])
-    assert tracker.origin.geodetic(np.zeros(3)) == pytest.approx(
-        ORIGIN.geodetic(np.array([300.0, 40.0, 0.0])) * [1.0, 1.0, 0.0],
-        abs=1e-6,
-    )
+    first = ORIGIN.geodetic(np.array([300.0, 40.0, 0.0])) * [1.0, 1.0, 0.0]
+    assert tracker.origin.geodetic(np.zeros(3)) == pytest.approx(first, abs=1e-6)
     assert estimates[-1].state[0, :2] == pytest.approx([0.0, 0.0], abs=1e-6)
     tracker.reset()
     assert tracker.origin is None
 
 
 def test_metres_without_an_origin_and_latitudes_do_not_mix():
-    def fix(second):
+    def metres(second):
         return Fix(stamp_ns=second * SECOND, position=(5.0, 0.0, 0.0), frame_id='map')
 
     first = DiverTracker(DiverConfig())
-    assert run(first, [fix(1), geodetic(2, (0, 0, 0)), fix(3)])[-1].stamp_ns == 3 * SECOND
+    assert run(first, [metres(1), geodetic(2, (0, 0, 0)), metres(3)])[-1].stamp_ns == 3 * SECOND
     assert first.counts['no_origin'] == 1 and first.origin is None
-    assert 'latitude' not in run(first, [fix(4)])[-1].extras
+    assert 'latitude' not in run(first, [metres(4)])[-1].extras
     second = DiverTracker(DiverConfig())
-    run(second, [geodetic(1, (0, 0, 0)), fix(2), pose(3, (0, 0, 0), 0.0)])
+    run(second, [geodetic(1, (0, 0, 0)), metres(2), pose(3, (0, 0, 0), 0.0)])
     assert second.counts['no_origin'] == 1
     run(second, [relative(3.5, (9.0, 0.0, 0.0)), pose(4, (0, 0, 0), 0.0)])
     assert second.counts['no_origin'] == 2
     assert 'parameter origin ' in second.warnings()[0]
     stated = DiverTracker(DiverConfig(origin=(59.0, 10.0, 0.0)))
-    both = run(stated, [geodetic(1, (5.0, 0.2, 0.0)), fix(2)])
+    both = run(stated, [geodetic(1, (5.0, 0.2, 0.0)), metres(2)])
     assert not stated.counts['no_origin'] and len(both[-1]) == 1
 
 
@@ -191,9 +181,6 @@ def test_a_vessel_whose_first_position_is_wrong_places_its_targets():
     assert last.extras['longitude'] == pytest.approx([there[1]], abs=2e-5)
 
 
-# -- relative to a vessel ------------------------------------------------------------------------
-
-
 def test_a_relative_fix_is_composed_with_the_pose_between_two_messages():
     config = DiverConfig(
         transceiver_lever=(2.0, 0.0, -1.0), transceiver_mount_rpy_deg=(0.0, 0.0, 90.0)
@@ -263,15 +250,8 @@ def test_a_heading_that_is_not_measured_gives_no_position(variance):
 
 def test_a_gap_in_the_poses_and_a_stamp_before_them_are_counted():
     tracker = DiverTracker(DiverConfig())
-    made = run(
-        tracker,
-        [
-            pose(5, (0, 0, 0), 0.0),
-            relative(4, (10.0, 0.0, 0.0)),
-            relative(7, (10.0, 0.0, 0.0)),
-            pose(9, (0, 0, 0), 0.0),
-        ],
-    )
+    between = [relative(4, (10.0, 0.0, 0.0)), relative(7, (10.0, 0.0, 0.0))]
+    made = run(tracker, [pose(5, (0, 0, 0), 0.0), *between, pose(9, (0, 0, 0), 0.0)])
     assert not made and tracker.counts['vessel_pose_gap'] == 2
 
 
@@ -333,11 +313,9 @@ def test_a_position_and_a_heading_make_a_pose():
 
 
 EXACT = {
-    'relative_range_std': 0.01,
-    'relative_angle_std_deg': 0.001,
-    'vessel_heading_std_deg': 0.0,
-    'vessel_attitude_std_deg': 0.0,
-}
+    'relative_range_std': 0.01, 'relative_angle_std_deg': 0.001,
+    'vessel_heading_std_deg': 0.0, 'vessel_attitude_std_deg': 0.0,
+}  # fmt: skip
 """Instruments without errors: what errors turn is shorter on average, which is undone."""
 
 
@@ -454,12 +432,8 @@ def test_the_tracker_is_consistent_with_all_errors_drawn():
             distance = np.linalg.norm(seen)
             turn = rotation(0.0, *np.radians(2.0) * rng.normal(size=2))
             offset = turn @ seen * (1.0 + 0.5 * rng.normal() / distance)
-            noisy = pose(
-                k,
-                where + 0.5 * rng.normal(size=3) * [1, 1, 0],
-                yaw + np.radians(rng.normal()),
-                frame_id='map',
-            )
+            at = where + 0.5 * rng.normal(size=3) * [1, 1, 0]
+            noisy = pose(k, at, yaw + np.radians(rng.normal()), frame_id='map')
             made = run(tracker, [noisy, relative(k, offset, frame_id='usbl')])
             last = made[-1] if made else last
         error, P = last.state[0, :2], last.covariance[0, :2, :2]

@@ -23,7 +23,7 @@ from sonar_imm.trackers.diver.known import Known
 from sonar_imm.trackers.diver.scan import position_groups, Scan
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
-from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
+from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate
 
 ASSOCIATIONS = ('gnn', 'jipda')
 
@@ -45,13 +45,9 @@ def test_a_scan_is_the_same_as_its_fixes_one_by_one():
     scans = []
     for stamp in sorted({item.stamp_ns for item in single}):
         own = sorted((item for item in single if item.stamp_ns == stamp), key=lambda i: i.key())
+        position, covariance = zip(*((item.position, item.covariance) for item in own))
         scans.append(
-            Fixes(
-                stamp_ns=stamp,
-                position=[item.position for item in own],
-                covariance=[item.covariance for item in own],
-                frame_id='map',
-            )
+            Fixes(stamp_ns=stamp, position=position, covariance=covariance, frame_id='map')
         )
     first, other = (run(DiverTracker(DiverConfig()), items) for items in (single, scans))
     assert len(first) == len(other) == len(scans)
@@ -171,9 +167,6 @@ def test_a_smoother_takes_scans_and_hides_what_does_not_exist():
     assert [ids_of(item) for item in smooth] == [ids_of(item) for item in forward]
 
 
-# -- names ---------------------------------------------------------------------------------------
-
-
 def test_named_fixes_make_a_track_each_though_they_cross_and_come_in_turn():
     tracker = DiverTracker(DiverConfig())
     for second in range(1, 60):
@@ -206,10 +199,7 @@ def test_a_scan_with_names_and_without():
 def test_existence_of_a_track_that_was_counted_is_guessed_from_its_state():
     tracker = DiverTracker(DiverConfig())
     tracker.process(scan(1, (0.0, 0.0), (20.0, 0.0), (40.0, 0.0)))
-    known, (group,) = (
-        tracker._stream.state,
-        Scan.from_items([scan(2)], tracker.config).fixes,
-    )
+    known, (group,) = tracker._stream.state, Scan.from_items([scan(2)], tracker.config).fixes
     status = [TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED]
     known = known.replace(life=evolve(known.life, status=np.array(status, np.uint8)))
     known = known.with_columns(existence=np.array([np.nan, np.nan, 0.3]))
@@ -254,9 +244,8 @@ def test_tracks_whose_numbers_are_not_finite_end_and_are_counted(monkeypatch):
 
 def ping(second):
     """The echoes of a diver at (20, 30, -2) at four receivers."""
-    rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
-    leg = np.linalg.norm(rx - [20.0, 30.0, -2.0], axis=1)
-    return arrivals(second * SECOND, rx, (leg + leg[0]) / 1500.0, tx=rx[0])
+    leg = np.linalg.norm(RECEIVERS - [20.0, 30.0, -2.0], axis=1)
+    return arrivals(second * SECOND, RECEIVERS, (leg + leg[0]) / 1500.0, tx=RECEIVERS[0])
 
 
 @pytest.mark.parametrize('dimensions', [2, 3])
@@ -328,11 +317,8 @@ def test_scans_near_another_track_are_counted_for_each_partner_alone():
     nobody = DiverTracker(DiverConfig())._stream.state
     mean = np.array([[0.0, 0.0], [50.0, 0.0], [50.1, 0.0], [0.1, 0.0]])
     now = nobody.replace(life=evolve(nobody.life, track_id=np.array([1, 2, 3, 4], np.uint32)))
-    now = now.with_columns(
-        target_id=np.full(4, NOBODY),
-        near_to=np.array([0, 1, 1, 1]),
-        near_for=np.array([0, 5, 5, 5]),
-    )
+    before = {'near_to': np.array([0, 1, 1, 1]), 'near_for': np.array([0, 5, 5, 5])}
+    now = now.with_columns(target_id=np.full(4, NOBODY), **before)
     tentative, wide = np.zeros(4, bool), np.tile(np.eye(2), (4, 1, 1))
     near_to, near_for = pruning.count_near_scans(now, tentative, mean, wide, [])
     assert near_to.tolist() == [0, 0, 2, 1]

@@ -6,69 +6,48 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The fathometer tracker with arrays: pressure, cross-spectra, dead hydrophones, lost blocks."""
+"""The fathometer tracker with arrays: lost blocks, faulty hydrophones, echoes of either sign."""
+
+from pathlib import Path
 
 from attrs import evolve
 from helpers.fathometer_runs import run
+from helpers.fathometer_vectors import signed_sets
+from helpers.sea_scenes import score_scene, sea_scene
+from helpers.set_cycle import cycle
 import numpy as np
+from oracles.set_particles import weigh
 import pytest
 
-from sonar_imm.acoustics.ambient import surface_noise_csdm
+from sonar_imm.acoustics.ambient import sample_csdm, surface_noise_csdm
+from sonar_imm.estimation.set_filter import SetFilter, Weighted
+from sonar_imm.estimation.set_model import SetModel
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
 from sonar_imm.trackers.fathometer import pressure
 from sonar_imm.trackers.fathometer.pressure import CompanionDepths
 from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array
-from sonar_imm.trackers.fathometer.tracker import FathometerConfig
-from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm_tools.simulation.fathometer.scenario import Drift
+from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, scenario, simulate
 
 SMALL = {**scenario('small').instruments(), 'particles': 2000}
 
 
 @pytest.fixture(scope='module')
-def pressure_scene():
+def blocks():
     changes = {
         'records': 1, 'record_seconds': 9.8, 'phones': 12, 'element_spacing': 0.18,
         'frequency_max': 2000.0, 'steps_per_sigma': 0.0, 'block_seconds': 0.7, 'array_depth': 73.5,
         'first_depth': 130.0,
     }  # fmt: skip
-    return simulate(scenario('pressure', changes), 1)
+    scene = simulate(scenario('pressure', changes), 1)
+    return [each.measurement for each in scene.measurements]
 
 
 PRESSURE = {
     'phones': 12, 'frequency_max': 2000.0, 'snapshot_seconds': 0.7, 'record_seconds': 9.8,
     'depth_min': 122.0, 'depth_max': 172.0, 'particles': 500,
 }  # fmt: skip
-
-
-def blocks(scene):
-    return [each.measurement for each in scene.measurements]
-
-
-def test_pressure_gives_what_its_cross_spectra_give(pressure_scene):
-    own = blocks(pressure_scene)
-    tracker, found = run(own, **PRESSURE)
-    assert len(found) == 1 and tracker.counts['blocks'] == len(own)
-    (estimate,) = found.values()
-
-    p = np.concatenate([each.pressure for each in own]).astype(np.float64)
-    n = 4200
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(n) / n)
-    parts = [
-        np.fft.rfft(p[k : k + n] * window[:, None], axis=0)
-        for k in range(0, len(p) - n + 1, n // 2)
-    ]
-    R = sum(part[:, :, None] * part[:, None, :].conj() for part in parts)
-    frequency = np.arange(n // 2 + 1) / 0.7
-    band = (frequency >= 50.0) & (frequency < 2000.001)
-    spectra = CrossSpectra(
-        stamp_ns=estimate.stamp_ns, frame_id='array', frequency=frequency[band].astype(np.float32),
-        csdm=R[band].astype(np.complex64), reference_depth=own[0].reference_depth,
-    )  # fmt: skip
-    other, same = run([spectra], **PRESSURE)
-    scale = tracker.response.sigma[0]
-    assert np.abs(other.response.amplitude - tracker.response.amplitude).max() < 0.01 * scale
-    assert other.response.sigma[0] == pytest.approx(scale, rel=1e-3)
-    assert np.allclose(same[estimate.stamp_ns].probabilities, estimate.probabilities, atol=0.02)
 
 
 @pytest.mark.statistics
@@ -94,21 +73,18 @@ def test_the_noise_is_measured_right_though_it_fades_with_depth():
     assert np.sqrt(np.mean(np.square(seen))) == pytest.approx(1.0, abs=0.06)
 
 
-def test_a_lost_block_is_counted_and_a_long_gap_begins_anew(pressure_scene):
-    own = blocks(pressure_scene)
-    tracker, found = run(own[:3] + own[4:], **PRESSURE)
+def test_a_lost_block_is_counted_and_a_long_gap_begins_anew(blocks):
+    tracker, found = run(blocks[:3] + blocks[4:], **PRESSURE)
     assert tracker.counts['gaps'] == 1 and not found
-    late = [evolve(each, stamp_ns=each.stamp_ns + 60 * 10**9) for each in own]
-    tracker, found = run(own[:6] + late, **PRESSURE)
+    late = [evolve(each, stamp_ns=each.stamp_ns + 60 * 10**9) for each in blocks]
+    tracker, found = run(blocks[:6] + late, **PRESSURE)
     assert tracker.counts['records_abandoned'] == 1
     assert len(found) == 1
 
 
-def test_a_preview_is_not_committed(pressure_scene):
-    own = blocks(pressure_scene)
-    again = [
-        evolve(each, stamp_ns=each.stamp_ns + k * round(9.8e9)) for k in range(3) for each in own
-    ]
+def test_a_preview_is_not_committed(blocks):
+    later = [k * round(9.8e9) for k in range(3)]
+    again = [evolve(each, stamp_ns=each.stamp_ns + by) for by in later for each in blocks]
     plain, found = run(again, **PRESSURE)
     eager, more = run(again, preview_seconds=2.8, **PRESSURE)
     assert eager.counts['previews'] > 3
@@ -119,31 +95,10 @@ def test_a_preview_is_not_committed(pressure_scene):
             assert each.state.tobytes() == found[stamp].state.tobytes()
 
 
-def test_the_small_drift_is_followed_from_cross_spectra_and_a_companion():
-    scene = simulate(scenario('small'), 3)
-    tracker, found = run([each.measurement for each in scene.measurements], **SMALL)
-    assert tracker.counts['array_depths'] == 12 and not tracker.counts['array_depth_unknown']
-    truth = {each.stamp_ns: each for each in scene.truth}
-    near = [
-        np.abs(each.state[0, 0] - truth[stamp].depth.min()) < 0.3 for stamp, each in found.items()
-    ]
-    assert len(near) == 12 and np.mean(near) > 0.9
-
-
 @pytest.fixture(scope='module')
 def spectra():
     scene = simulate(scenario('small', {'records': 1, 'depth_companion': False}), 5)
     return scene.measurements[0].measurement
-
-
-def changed(spectra, csdm=None, **fields):
-    return CrossSpectra(
-        stamp_ns=spectra.stamp_ns,
-        frequency=fields.pop('frequency', spectra.frequency),
-        csdm=spectra.csdm if csdm is None else csdm,
-        reference_depth=fields.pop('reference_depth', spectra.reference_depth),
-        **fields,
-    )
 
 
 @pytest.mark.parametrize('dead', [0, 3, 7])
@@ -154,29 +109,23 @@ def test_a_dead_hydrophone_is_left_out_and_changes_little(spectra, dead):
     depth = spectra.reference_depth
     lattice = lattice_of_array(depth, config)
     whole = array_response(spectra, lattice, config, depth)
-    masked = array_response(changed(spectra, csdm), lattice, config, depth)
+    masked = array_response(evolve(spectra, csdm=csdm), lattice, config, depth)
     peak = whole.amplitude.argmax()
     assert masked.amplitude[peak] > 0.5 * whole.amplitude[peak]
     assert np.corrcoef(whole.amplitude, masked.amplitude)[0, 1] > 0.5
-    tracker, found = run([changed(spectra, csdm)], **SMALL)
+    tracker, found = run([evolve(spectra, csdm=csdm)], **SMALL)
     assert found and tracker.counts['dead_hydrophones_masked'] == 1
     assert tracker.health()['dead_hydrophones'] == 1.0
 
 
 def test_hostile_cross_spectra_are_counted_and_stop_nothing(spectra):
     each = np.ones((len(spectra), 8, 8), np.complex64)
+    uneven = 0.3 * np.sin(np.arange(len(spectra)))
     cases = {
-        'singular': ([changed(spectra, each)], {'loading': 0.0}),
-        'wrong_hydrophones': ([changed(spectra, spectra.csdm[:, :7, :7])], {}),
+        'singular': ([evolve(spectra, csdm=each)], {'loading': 0.0}),
+        'wrong_hydrophones': ([evolve(spectra, csdm=spectra.csdm[:, :7, :7])], {}),
         'bad_band': ([spectra], {'frequency_min': 5000.0, 'frequency_max': 6000.0}),
-        'bad_frequency': (
-            [
-                changed(
-                    spectra, frequency=spectra.frequency + 0.3 * np.sin(np.arange(len(spectra)))
-                )
-            ],
-            {},
-        ),
+        'bad_frequency': ([evolve(spectra, frequency=spectra.frequency + uneven)], {}),
         'too_crowded': ([spectra], {'min_separation': 30.0}),
         'too_large': ([spectra], {'depth_step': 1e-4}),
     }
@@ -184,7 +133,7 @@ def test_hostile_cross_spectra_are_counted_and_stop_nothing(spectra):
         tracker, found = run(items, **{**SMALL, **options})
         assert tracker.counts[reason] == 1, (reason, tracker.counts)
         assert not found
-    tracker, found = run([changed(spectra, each)], **SMALL)
+    tracker, found = run([evolve(spectra, csdm=each)], **SMALL)
     assert tracker.counts['rank_deficient'] == 1
 
 
@@ -192,15 +141,14 @@ def test_missing_frequencies_do_no_harm(spectra):
     keep = np.ones(len(spectra), bool)
     keep[50:60] = False
     tracker, _ = run([spectra], **SMALL)
-    other, _ = run(
-        [changed(spectra, spectra.csdm[keep], frequency=spectra.frequency[keep])], **SMALL
-    )
+    holed = evolve(spectra, csdm=spectra.csdm[keep], frequency=spectra.frequency[keep])
+    other, _ = run([holed], **SMALL)
     a, b = tracker.response.amplitude, other.response.amplitude
     assert np.corrcoef(a, b)[0, 1] > 0.9
 
 
 def test_where_the_array_is(spectra):
-    bare = changed(spectra, reference_depth=None)
+    bare = evolve(spectra, reference_depth=None)
     for companion, options, expected in (
         ([ArrayDepth(stamp_ns=bare.stamp_ns - 10**9, depth=70.0)], {}, 70.0),
         ([ArrayDepth(stamp_ns=bare.stamp_ns - 10**12, depth=70.0)], {'array_depth': 60.0}, 60.0),
@@ -209,6 +157,7 @@ def test_where_the_array_is(spectra):
         tracker, _ = run([*companion, bare], **{**SMALL, **options})
         assert tracker.response.reference_depth == expected
         assert tracker.counts['array_depth_unknown'] == (expected == 0.0)
+        assert tracker.counts['array_depths'] == len(companion)
 
 
 def test_the_nearest_depth_counts_before_or_after(monkeypatch):
@@ -246,3 +195,221 @@ def test_an_echo_of_the_processor_is_even_about_its_layer():
         odd[pulse] = np.abs(b[middle + near] - b[middle - near]).max() / b[middle]
     # The band leaves the phase in: its response is the same as ever.
     assert odd['processor'] < 0.02 < 0.04 < odd['band']
+
+
+SCENE = {
+    'level': 'csdm', 'records': 6, 'snapshots': 100, 'snapshot_seconds': 0.2,
+    'first_amplitude': 0.35,
+}  # fmt: skip
+FOUND = {'particles': 2000, 'depth_min': 42.0, 'depth_max': 74.0}
+
+
+@pytest.fixture(scope='module')
+def scene():
+    config = scenario('pressure', SCENE)
+    made = simulate(config, 2)
+    return [each.measurement for each in made.measurements], made.truth, config.instruments()
+
+
+def with_responses(records, response):
+    """response (F, M) or (M,)."""
+    for each in records:
+        c = np.broadcast_to(response, (len(each), each.hydrophones)).astype(np.complex64)
+        yield evolve(each, csdm=each.csdm * c[:, :, None] * c.conj()[:, None, :])
+
+
+def share_right(found, truth):
+    there = {each.stamp_ns: len(each.depth) for each in truth}
+    orders = {
+        stamp: int(each.model_names[each.probabilities[0].argmax()].split('_')[1])
+        for stamp, each in found.items()
+    }
+    late = sorted(orders)[2:]
+    return np.mean([orders[stamp] == there[stamp] for stamp in late])
+
+
+def test_gain_sign_and_delay_are_taken_out_and_said(scene):
+    records, truth, instruments = scene
+    response = np.ones((len(records[0]), 16), np.complex128)
+    response[:, 2] *= 0.5
+    response[:, 4] *= -1.0
+    response[:, 9] *= np.exp(-2j * np.pi * records[0].frequency * 80e-6)
+    faulty = list(with_responses(records, response))
+    tracker, found = run(faulty, **instruments, **FOUND)
+    assert share_right(found, truth) == 1.0
+    sentences = tracker.warnings()
+    assert sentences[:2] == [
+        'hydrophone 2 is 6.0 dB below the others; its signal was levelled',
+        'hydrophone 4 is turned; it was turned back',
+    ]
+    assert sentences[2] in [
+        f'hydrophone 9 is {late} us late; it was shifted' for late in range(74, 87)
+    ]
+    assert len(sentences) == 3
+    health = tracker.health()
+    assert health['phone_gain_db_2'] == pytest.approx(-6.0, abs=0.1)
+    assert health['phone_sign_4'] == -1.0
+    assert health['phone_delay_9'] == pytest.approx(80e-6, abs=6e-6)
+    assert not [name for name in health if name.endswith('_3')]
+
+    plain, lost = run(faulty, **instruments, **FOUND, phone_correction='off')
+    assert share_right(lost, truth) < 0.5 and plain.warnings() == []
+
+
+def test_a_foreign_hydrophone_is_left_out_and_said(scene):
+    records, truth, instruments = scene
+    rng = np.random.default_rng(6)
+    faulty = []
+    for each in records:
+        csdm = each.csdm.copy()
+        alone = sample_csdm(np.repeat(np.eye(16)[None], len(each), axis=0), 100, rng)
+        alone = alone * csdm[:, 0, 0].real[:, None, None]
+        csdm[:, 12], csdm[:, :, 12] = alone[:, 12], alone[:, :, 12]
+        faulty.append(evolve(each, csdm=csdm))
+    tracker, found = run(faulty, **instruments, **FOUND)
+    assert share_right(found, truth) == 1.0
+    assert tracker.warnings() == [
+        "hydrophone 12 has 0 % of its neighbours' sound; it was left out"
+    ]
+    assert tracker.counts['foreign_hydrophones_left_out'] == 6
+
+
+def test_equal_hydrophones_say_nothing_and_keep_the_score(scene):
+    records, truth, instruments = scene
+    tracker, found = run(records, **instruments, **FOUND)
+    assert tracker.warnings() == [] and share_right(found, truth) == 1.0
+    assert not tracker.counts['foreign_hydrophones_left_out']
+    assert not [name for name in tracker.health() if name.startswith('phone_')]
+
+
+def test_many_that_differ_are_in_one_sentence(scene):
+    records, _, instruments = scene
+    gain = np.ones(16)
+    gain[::2] = 2.0 ** np.arange(1, 9)
+    tracker, _ = run(with_responses(records[:1], gain), **instruments, **FOUND)
+    (sentence,) = tracker.warnings()
+    assert sentence.count(' dB ') == 6
+    assert sentence.endswith('more; their signals were levelled')
+
+
+VECTORS = Path(__file__).parents[2] / 'vectors'
+
+
+@pytest.mark.parametrize('compiled', [False, True])
+def test_a_set_with_a_wrong_sign_is_impossible(compiled):
+    impossible = 0
+    for case in signed_sets(VECTORS):
+        if compiled:
+            filter_ = SetFilter(case.model, 1)
+            record = filter_.record(case.response, (0, 0))
+            step = filter_.weigh(Weighted(case.sets, np.zeros(1)), record)
+            found, amplitude = step.after.log_weight, step.amplitude
+        else:
+            found, amplitude = weigh(case.model, case.response, case.sets)
+        assert found[0] == pytest.approx(case.log_likelihood, abs=1e-9)
+        impossible += np.isinf(case.log_likelihood)
+        if np.isfinite(case.log_likelihood):
+            assert amplitude[0] == pytest.approx(case.amplitude, abs=1e-9)
+    assert impossible == 24
+
+
+def test_the_filter_agrees_with_the_sum_over_all_sets_of_one():
+    """One member or none, on 12 cells: the posterior of place and sign by enumeration."""
+    n, prior, std = 12, 0.2, 3.0
+    switch = np.array([[0.7, 0.3], [0.2, 0.8]])
+    walk = np.array([0.25, 0.5, 0.25])
+    model = SetModel(
+        cells=n, separation=2, order_min=0, transition=switch, walk=walk,
+        gram=np.exp(-0.5 * np.arange(n) ** 2.0), amplitude_std=std, negative_probability=prior,
+    )  # fmt: skip
+    rng = np.random.default_rng(3)
+    b = rng.standard_normal((3, n))
+    b[:, 4] -= 3.5
+    none, single = 0.5, 0.5 * np.outer([1.0 - prior, prior], np.full(n, 1.0 / n))
+    K = sum(w * np.eye(n, k=shift) for w, shift in zip(walk, (-1, 0, 1)))
+    tracker, before = SetFilter(model, 200_000), None
+    for name, record in enumerate(b):
+        born = none * switch[0, 1] * np.outer([1.0 - prior, prior], np.full(n, 1.0 / n))
+        none = none * switch[0, 0] + single.sum() * switch[1, 0]
+        single = single @ K * switch[1, 1] + born
+        variance = 1.0 / (1.0 + std**-2)
+        likelihood = np.exp(0.5 * variance * record**2) / np.sqrt(1.0 + std**2)
+        single = single * np.where(np.array([[1.0], [-1.0]]) * record > 0.0, likelihood, 0.0)
+        total = none + single.sum()
+        none, single = none / total, single / total
+        step = cycle(tracker, before, record, (5, name))
+        before = step.after
+        there = step.sets.order == 1
+        found = np.zeros((2, n))
+        row = (step.sets.sign[there, 0] < 0).astype(int)
+        np.add.at(found, (row, step.sets.cell[there, 0]), step.w[there])
+        assert step.log_evidence == pytest.approx(np.log(total), abs=0.02)
+        assert np.abs(found - single).sum() < 0.03
+    assert single[1].sum() > 0.3
+
+
+def test_negative_layers_are_found_where_they_are_looked_for():
+    scene = sea_scene('negative')
+    tracker, found = run(scene.traces(), particles=3000, polarity='both')
+    assert tracker.warnings() == []
+    score = score_scene(found, scene, after=5)
+    assert score.right >= 0.95 and score.ospa <= 0.03
+    for stamp, estimate in found.items():
+        if stamp > 5 * 10**9:
+            near = np.abs(estimate.state[:, :1] - scene.depth_at(stamp)).argmin(axis=1)
+            expected = np.sign(scene.amplitude[near])
+            assert np.array_equal(estimate.extras['polarity'], expected)
+            assert np.array_equal(np.sign(estimate.state[:, 1]), expected)
+            assert estimate.extras['polarity'].dtype == np.int8
+    tracker, found = run(scene.traces(range(30)), particles=2000, polarity='positive')
+    assert 'negative echoes' in ' '.join(tracker.warnings())
+    assert score_scene(found, scene, after=5).right == 0.0
+    assert all((each.extras['polarity'] >= 0).all() for each in found.values())
+
+
+def test_negative_layers_under_an_array_are_found_at_the_defaults():
+    """Six layers, of which two are negative, as cross-spectra; traces keep the plain defaults."""
+    rng, changes = np.random.default_rng(7), {'records': 10, 'snapshots': 100}
+    config = scenario('pressure', {'level': 'csdm', 'snapshot_seconds': 0.35, **changes})
+    depth = np.array([52.0, 55.2, 58.5, 61.7, 66.0, 69.3])
+    depth = depth + np.cumsum(0.05 * rng.standard_normal((10, 6)), axis=0)
+    array = config.array_depth + rng.uniform(-0.5, 0.5, 10)
+    stated = array + config.array_depth_std * rng.standard_normal(10)
+    amplitude = np.tile([0.35, 0.3, -0.25, 0.22, -0.2, 0.15], (10, 1))
+    floor = Drift(depth, amplitude, amplitude != 0.0, array, stated)
+    settings = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
+    settings |= {'depth_min': config.depth_min, 'depth_max': config.depth_max, 'particles': 3000}
+    settings |= {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
+    tracker = FathometerTracker(FathometerConfig(**settings, window='rectangular', overlap=0.0))
+    for record, told in enumerate(stated.tolist()):
+        (found,) = tracker.process(cross_spectra(config, floor, record, told, rng))
+    assert found.state[:, 0] == pytest.approx(depth[-1], abs=0.2)
+    assert np.array_equal(found.extras['polarity'], np.sign(amplitude[-1]))
+    assert tracker.warnings() == []
+
+
+@pytest.mark.parametrize(
+    ('hydrophones', 'changes', 'expected'),
+    [
+        (16, {}, ('processor', 'both')),
+        (0, {}, ('band', 'positive')),
+        (5, {}, ('band', 'positive')),
+        (16, {'processor': 'conventional'}, ('band', 'positive')),
+        (16, {'envelope': True}, ('band', 'positive')),
+        (16, {'pulse': 'band'}, ('band', 'positive')),
+        (16, {'polarity': 'positive'}, ('processor', 'positive')),
+        (5, {'pulse': 'processor'}, ('processor', 'both')),
+        (0, {'pulse': 'processor'}, ('processor', 'positive')),
+    ],
+)
+def test_what_auto_stands_for(hydrophones, changes, expected):
+    """Five hydrophones .25 m apart are a fifteenth of the wave of 100 Hz."""
+    config = FathometerConfig(element_spacing=0.25, frequency_min=100.0, **changes)
+    settled = config.settled(hydrophones)
+    assert (settled.pulse, settled.polarity) == expected
+    assert settled.settled(0) is settled
+
+
+def test_reflectors_are_negative_where_both_signs_are_asked_for():
+    assert FathometerConfig(polarity='both').negative_share == 0.05
+    assert FathometerConfig(polarity='positive').negative_share == 0.0

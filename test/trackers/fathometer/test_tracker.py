@@ -6,24 +6,28 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The fathometer tracker as its users see it: measurements in, estimates out."""
+"""The fathometer tracker as its users see it: measurements in, estimates out; widths of echoes."""
+
+from types import SimpleNamespace
 
 from attrs import evolve
 from helpers.fathometer_runs import run
+from helpers.sea_scenes import score_scene
 from helpers.vector_files import load_vectors
-from hypothesis import given, settings
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from sonar_imm.estimation.consistency import nees, ospa
+from sonar_imm.acoustics.pulse import band_pulse
+from sonar_imm.estimation.consistency import nees
 from sonar_imm.measurements import Rejection, Trace
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.fathometer.response import lattice_of_trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm.trackers.fathometer.width import EchoWidth, half_width
 from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 RECORD_NS = 90 * 10**9
+SEVEN = {'order_min': 7, 'order_max': 8}
 
 
 @pytest.fixture(scope='module')
@@ -56,15 +60,12 @@ def truths(truth):
 
 def score(found, vectors):
     """Share of records whose order is right, and mean OSPA."""
-    right, distance = [], []
-    for stamp, estimate in found.items():
+
+    def there(stamp):
         k = stamp // RECORD_NS - 1
-        there = vectors['reflector_depth'][k][vectors['present'][k]].astype(float)
-        order = int(estimate.model_names[estimate.probabilities[0].argmax()].split('_')[1])
-        right.append(order == len(there))
-        seen = estimate.state[np.isfinite(estimate.state[:, 0]), :1]
-        distance.append(ospa(seen, there[:, None], cutoff=2.0, order=2.0))
-    return np.mean(right), np.mean(distance)
+        return vectors['reflector_depth'][k][vectors['present'][k]].astype(float)
+
+    return score_scene(found, SimpleNamespace(depth_at=there), after=0)
 
 
 @pytest.mark.statistics
@@ -111,7 +112,7 @@ def test_the_uncertainty_of_depths_covers_the_depth_sensor(vectors):
 
 
 def test_a_perfect_depth_sensor_needs_no_allowance():
-    measured, truth = drift(array_depth_std=0.0)
+    measured, truth = drift(records=70, array_depth_std=0.0)
     exact = {'array_depth_std': 0.0, 'sound_speed_std': 0.0}
     _, found = run(measured, particles=3000, **exact)
     assert 0.6 < depth_nees(found, truths(truth)) < 1.2
@@ -170,9 +171,8 @@ def test_columns_are_those_of_the_contract(vectors):
     columns = found[RECORD_NS].columns()
     names = list(columns)
     assert names[:3] == ['x', 'y', 'z']
-    assert names[3:8] == [
-        'depth', 'amplitude', 'cov_depth_depth', 'cov_depth_amplitude', 'cov_amplitude_amplitude',
-    ]  # fmt: skip
+    covariance = ['cov_depth_depth', 'cov_depth_amplitude', 'cov_amplitude_amplitude']
+    assert names[3:8] == ['depth', 'amplitude', *covariance]
     assert names[8:20] == [f'prob_order_{k}' for k in range(1, 13)]
     assert {'track_id', 'existence'} <= set(names[20:])
     assert columns['track_id'].dtype == np.uint32
@@ -218,28 +218,22 @@ def test_strange_input_is_counted(vectors):
     assert tracker.counts['other_depths'] == 1
 
 
-def test_a_running_tracker_takes_over_what_may_change():
-    tracker = FathometerTracker(FathometerConfig())
-    tracker.reconfigure(FathometerConfig(existence_min=0.7))
-    assert tracker.config.existence_min == 0.7
-    with pytest.raises(ValueError, match='particles'):
-        tracker.reconfigure(FathometerConfig(particles=7))
-
-
 @pytest.mark.parametrize(
     'parameters, word',
     [
         ({'order_min': 9, 'order_max': 7}, 'order_max'),
-        ({'order_min': 7, 'order_max': 8, 'order_transition_matrix': [1.0]}, '2 x 2'),
-        (
-            {'order_min': 7, 'order_max': 8, 'order_transition_matrix': [0.5, 0.5, 0.5, 0.6]},
-            'row 1',
-        ),
+        ({**SEVEN, 'order_transition_matrix': [1.0]}, '2 x 2'),
+        ({**SEVEN, 'order_transition_matrix': [0.5, 0.5, 0.5, 0.6]}, 'row 1'),
         ({'pulse': 'file'}, 'pulse_file'),
         ({'frequency_min': 5000.0}, 'frequency_max'),
         ({'depth_min': 50.0}, 'depth_max'),
         ({'particles': 0}, 'particles'),
         ({'particles': 10_000_000, 'order_max': 12}, 'memory'),
+        ({'heave': 'memory', 'array_depth_std': 0.0}, 'array_depth_std'),
+        ({'output': 'printed', 'processor': 'white_noise'}, 'printed'),
+        ({'noise_depth_min': 10.0, 'noise_depth_max': 0.0}, 'noise_depth_max'),
+        ({'negative_probability': 1.0}, 'negative_probability'),
+        ({'snapshot_seconds': 1e-4}, '0.001'),
     ],
 )
 def test_configurations_that_cannot_be(parameters, word):
@@ -293,33 +287,84 @@ def test_a_fine_trace_is_tracked_where_reflectors_move_little():
     assert len(tracker.process(fine_trace())) == 1
 
 
-@settings(max_examples=30, deadline=None)
-@given(
-    scale=st.floats(-30.0, 30.0),
-    sigma=st.floats(-40.0, 30.0),
-    seed=st.integers(0, 1000),
-    separation=st.floats(1e-3, 3.0),
-)
-def test_states_are_finite_however_strange_the_numbers(scale, sigma, seed, separation):
-    rng = np.random.default_rng(seed)
-    depth = np.linspace(20.0, 40.0, 200)
-    amplitude = 10.0**scale * rng.standard_normal(200)
-    amplitude[::17] *= 1e6
-    amplitude[::23] = np.nan
-    tracker = FathometerTracker(FathometerConfig(particles=50, min_separation=separation))
-    for stamp in (1, 2, 3):
-        noise = 10.0**sigma * (1.0 + rng.random(200))
-        trace = Trace(stamp_ns=stamp, depth=depth, amplitude=amplitude, sigma=noise)
-        for estimate in tracker.process(trace):
-            there = estimate.extras['track_id'] > 0
-            assert np.isfinite(estimate.state[there]).all()
-            assert np.isfinite(estimate.covariance[there]).all()
-            assert np.isfinite(estimate.probabilities).all()
-
-
 def test_conventional_amplitudes_are_a_third_unless_they_are_remembered():
     """As its echoes stand out by a third; phantoms that are remembered would be too cheap."""
     assert FathometerConfig().amplitude_std == 7.5
     conventional = FathometerConfig(processor='conventional')
     assert conventional.amplitude_std == 2.5
     assert evolve(conventional, amplitude_memory=0.9).amplitude_std == 7.5
+
+
+LAYERS, STRENGTH = np.array([14.0, 19.5, 27.0]), np.array([1.0, 0.5, 0.3])
+
+
+def made(width, records=12, noise=0.05, seed=5):
+    """Traces (T,) of three Gaussian echoes that wander."""
+    rng, depth, layers = np.random.default_rng(seed), 0.1 * np.arange(400), LAYERS
+    for k in range(records):
+        layers = layers + 0.05 * rng.standard_normal(3)
+        echoes = np.exp(-0.5 * np.square((depth[:, None] - layers) / width)) @ STRENGTH
+        yield Trace(
+            stamp_ns=(k + 1) * 10**9,
+            depth=depth,
+            amplitude=echoes + noise * rng.standard_normal(400),
+            sigma=np.full(400, noise),
+        )
+
+
+def test_half_width_is_that_of_the_narrowest_loud_echo():
+    z = np.arange(400, dtype=np.float64)
+    b = 40.0 * np.exp(-0.5 * np.square((z - 100.3) / 4.0))
+    b += 60.0 * np.exp(-0.5 * np.square((z - 200.0) / 9.0))
+    b += 9.0 * np.exp(-0.5 * np.square((z - 300.0) / 2.0))  # not loud
+    assert half_width(b) == pytest.approx(4.0 * np.sqrt(2.0 * np.log(2.0)), rel=0.02)
+    assert np.isnan(half_width(0.1 * b)) and np.isnan(half_width(np.zeros(5)))
+    # It has to end within the trace on both sides.
+    assert np.isnan(half_width(40.0 * np.exp(-z / 50.0)))
+
+
+@pytest.mark.parametrize('width', [0.15, 0.25, 0.5, 1.0])
+def test_width_of_the_echoes_is_found_and_used_from_the_first_trace_on(width):
+    tracker, found = run(made(width), particles=1000)
+    assert tracker.health()['pulse_width'] == pytest.approx(width, rel=0.15)
+    orders = [int(np.argmax(each.probabilities[0])) + 1 for each in found.values()]
+    assert orders == [3] * 12 and tracker.warnings() == []
+    assert len(set(np.concatenate([e.extras['track_id'] for e in found.values()]))) == 3
+
+
+def test_pulse_of_the_band_is_left_alone():
+    config, band = FathometerConfig(), band_pulse(50.0, 4000.0, 1500.0)
+    traces = load_vectors('fathometer/mvdr_traces')
+    found = EchoWidth()
+    for amplitude, sigma in zip(traces['amplitude'][:60], traces['sigma']):
+        trace = Trace(
+            stamp_ns=1,
+            depth=traces['depth'],
+            amplitude=amplitude,
+            sigma=np.full(len(amplitude), sigma),
+        )
+        assert not found.take(trace, config, band)
+    assert found.effective(config) == config
+    # What is told is used, and echoes narrower than the samples say nothing.
+    wide = next(made(0.5))
+    assert not EchoWidth().take(wide, FathometerConfig(pulse='band'), band)
+    assert not EchoWidth().take(next(made(0.03)), config, band)
+
+
+def test_pulse_is_judged_anew_until_many_traces_have_shown_it():
+    found, config, band = EchoWidth(), FathometerConfig(), band_pulse(50.0, 4000.0, 1500.0)
+    widths = np.repeat([0.3, 0.5, 0.8, 1.3, 2.0], [1, 4, 10, 45, 20])
+    taken = [found.take(next(made(width)), config, band) for width in widths]
+    assert (np.flatnonzero(taken) + 1).tolist() == [1, 5, 15, 60]
+
+
+def test_room_for_all_reflectors_is_left():
+    found, config = EchoWidth(), FathometerConfig(order_max=12)
+    assert found.take(next(made(2.0)), config, band_pulse(50.0, 4000.0, 1500.0))
+    own = found.effective(config)
+    assert own.pulse == 'gaussian' and own.pulse_width == pytest.approx(2.0, rel=0.2)
+    assert 12.0 * own.min_separation < 40.0
+    FathometerTracker(config).process(next(made(2.0)))
+    found._seen = np.array([np.nan])
+    with pytest.raises(ValueError, match='no echo is as wide'):
+        found.require()

@@ -38,9 +38,6 @@ def vectors(name):
     return dict(np.load(VECTORS / f'{name}.npz'))
 
 
-# -- motion ---------------------------------------------------------------------------------------
-
-
 def moved(data, i, x, P):
     """Case i of `motion.npz` from the states x (n, 10), P (n, 10, 10)."""
     behaviour, dt = int(data['behaviour'][i]), float(data['dt'][i])
@@ -84,9 +81,6 @@ def test_the_covariance_of_a_step_is_that_of_its_derivatives(i):
     if data['behaviour'][i] == 0:
         got, exact, width = got[:8, :8], exact[:8, :8], width[:8]
     assert_allclose(got / np.outer(width, width), exact / np.outer(width, width), atol=0.02)
-
-
-# -- messages -------------------------------------------------------------------------------------
 
 
 def linear_tracks(data):
@@ -161,9 +155,6 @@ def test_an_error_that_is_switched_off_is_told_by_nobody():
     assert L[:, :4, :4].any(axis=(1, 2)).all()
 
 
-# -- two assumptions ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize('case', [0, 1, 2])
 def test_both_assumptions_equal_the_vectors(case):
     data = vectors('ins_good')
@@ -233,9 +224,6 @@ def test_nothing_is_split_where_nothing_is_in_doubt():
     found, probability = navigation_errors.under_two_assumptions(mixture, sure, 9.0, certain)
     assert_allclose(probability, 1.0)
     assert np.isfinite(found.x).all() and np.isfinite(found.mu).all()
-
-
-# -- the tracker ----------------------------------------------------------------------------------
 
 
 def dived(drift=(0.0, 0.0), yaw_deg=0.0, late=0.0, **values):
