@@ -40,8 +40,7 @@ from sonar_imm.texts import visible
 
 from ..recordings.sources import BagError
 from .numbers import Card, Check, counted, flatten, front
-from .plotting import plain_content
-from .thumbnails import thumbnail
+from .plotting import plain_content, thumbnail
 
 LEAST_GL_POINTS = 2000
 MOST_GL_FIGURES = 4

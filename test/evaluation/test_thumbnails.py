@@ -14,8 +14,8 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 
+from sonar_imm_tools.evaluation.plotting import HEIGHT, MARGIN, thumbnail, THUMBNAIL_POINTS, WIDTH
 from sonar_imm_tools.evaluation.report import front_html, Part, Section
-from sonar_imm_tools.evaluation.thumbnails import HEIGHT, MARGIN, MOST_POINTS, thumbnail, WIDTH
 
 
 def line(x, y, **layout):
@@ -48,8 +48,8 @@ def test_a_line_goes_from_corner_to_corner(layout, first, last):
 def test_gaps_break_a_line_and_long_lines_are_thinned():
     svg = thumbnail(line([0.0, 1.0, np.nan, 3.0], [0.0, 1.0, np.nan, 0.0]))
     assert svg.count('M') == 2 and svg.count('L') == 1
-    many = np.arange(10.0 * MOST_POINTS)
-    assert thumbnail(line(many, many)).count('L') == MOST_POINTS - 1
+    many = np.arange(10.0 * THUMBNAIL_POINTS)
+    assert thumbnail(line(many, many)).count('L') == THUMBNAIL_POINTS - 1
 
 
 def test_points_areas_and_figures_without_lines():

@@ -8,8 +8,7 @@
 
 """How runs of the bathymetry tracker are judged: the floor along each ping against the true floor.
 
-`profiles` pairs estimate and truth of each ping, `scoring` compares them. `METRICS`,
-`summary_sentence` and `figures` present the result.
+`METRICS`, `summary_sentence` and `figures` present what `scoring` finds.
 """
 
 from __future__ import annotations
@@ -26,8 +25,7 @@ from sonar_imm.soundings import SIDES
 from ...offline.run_folder import read_truth, RunFolder
 from ..judging import JudgeOptions, Limit, naming, Scored
 from ..numbers import error, fill, look_up, Metric, NO_TRUTH
-from .profiles import profiles_of
-from .scoring import score
+from .scoring import profiles_of, score
 
 if TYPE_CHECKING:
     from ..report import Section

@@ -42,8 +42,7 @@ from ..plotting import (
     thin,
 )
 from ..report import Section
-from .profiles import Profile, Swath
-from .scoring import BAND, runs
+from .scoring import BAND, Profile, runs, Swath
 
 MOST_BINS = 1200
 DIRECTIONS = 161

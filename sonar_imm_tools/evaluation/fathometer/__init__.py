@@ -8,9 +8,7 @@
 
 """How runs of the fathometer tracker are judged: sets of reflectors against true sets.
 
-`records` pairs estimates and truth, `scoring` compares numbers, depths and amplitudes of the
-reflectors. `METRICS`, `summary_sentence`
-and `figures` present the result.
+`METRICS`, `summary_sentence` and `figures` present what `scoring` finds.
 """
 
 from __future__ import annotations
@@ -21,8 +19,7 @@ from typing import Any, TYPE_CHECKING
 from ...offline.run_folder import read_truth, RunFolder
 from ..judging import JudgeOptions, Limit, Scored
 from ..numbers import error, fill, Metric, NO_TRUTH
-from .records import records_of
-from .scoring import CUTOFF, score
+from .scoring import CUTOFF, records_of, score
 
 if TYPE_CHECKING:
     from ..report import Section

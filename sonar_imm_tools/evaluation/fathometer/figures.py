@@ -24,8 +24,7 @@ from ... import SECOND
 from ...offline.run_folder import read_measurements
 from ..plotting import add_image, add_line, add_points, BARE, COLOURS, INK, styled, TIME
 from ..report import Section
-from .records import Image, Record, Reflections
-from .scoring import pair
+from .scoring import Image, pair, Record, Reflections
 
 MOST_DEPTHS, MOST_RECORDS = 500, 1500
 OVER_TIME = {'title': 'time [s]', 'showgrid': False}

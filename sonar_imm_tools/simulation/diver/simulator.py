@@ -32,15 +32,18 @@ from sonar_imm.parameters import parameter
 from sonar_imm.truth import Received, Scene, TrueTrack
 
 from ..scenario import delay_ns, Scenario, Scenarios, stamps_of
-from .afloat import (
+from .fixes import (
+    CROSSING,
+    crossing_paths,
     GEODETIC,
     instruments_of_places,
+    instruments_of_scans,
     namespace_of,
     sense_from_vessel,
     sense_geodetic,
+    sense_scan,
     USBL,
 )
-from .crossing import CROSSING, crossing_paths, instruments_of_scans, sense_scan
 
 MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still', 'crossing')
 SENSORS = ('polar', 'positions', 'multistatic_fixes', 'arrivals', 'scans', 'geodetic', 'usbl')

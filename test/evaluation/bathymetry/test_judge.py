@@ -17,7 +17,7 @@ import pytest
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.evaluation.bathymetry import truth_topics
 from sonar_imm_tools.evaluation.bathymetry.figures import spectrum_figure
-from sonar_imm_tools.evaluation.bathymetry.profiles import profile_of
+from sonar_imm_tools.evaluation.bathymetry.scoring import profile_of
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate

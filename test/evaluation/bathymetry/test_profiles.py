@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimates import Estimate
-from sonar_imm_tools.evaluation.bathymetry.profiles import profile_of, profiles_of, rough_models
+from sonar_imm_tools.evaluation.bathymetry.scoring import profile_of, profiles_of, rough_models
 
 RANGES = np.array([20.0, 20.5, 21.0, 21.5])
 

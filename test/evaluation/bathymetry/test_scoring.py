@@ -20,8 +20,7 @@ from sonar_imm_tools.evaluation.bathymetry.figures import (
     profile_figure,
     verdict_figure,
 )
-from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, Swath, TrueFloor
-from sonar_imm_tools.evaluation.bathymetry.scoring import runs, score
+from sonar_imm_tools.evaluation.bathymetry.scoring import Profile, runs, score, Swath, TrueFloor
 from sonar_imm_tools.evaluation.numbers import cards, lines
 from sonar_imm_tools.survey.chart import Chart
 

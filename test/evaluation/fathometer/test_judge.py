@@ -23,8 +23,13 @@ from sonar_imm_tools.evaluation.fathometer.figures import (
     response_figure,
     response_image,
 )
-from sonar_imm_tools.evaluation.fathometer.records import Record, records_of, Reflections
-from sonar_imm_tools.evaluation.fathometer.scoring import pair, score
+from sonar_imm_tools.evaluation.fathometer.scoring import (
+    pair,
+    Record,
+    records_of,
+    Reflections,
+    score,
+)
 from sonar_imm_tools.evaluation.judging import judge
 from sonar_imm_tools.offline.run_folder import read_measurements, RunFolder
 from sonar_imm_tools.recordings.sources import BagError
