@@ -6,7 +6,11 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""A dask cluster on Slurm, until Enter is pressed. Prints the address of its scheduler."""
+"""A dask cluster on Slurm, until Enter is pressed. Prints the address of its scheduler.
+
+Run with dask-jobqueue 0.9 and a stand-in for sbatch, as in test/offline/test_tracking.py: the
+scripts of four jobs are handed in, and cancelled at the end. Not run on a Slurm of its own.
+"""
 
 from dask_jobqueue import SLURMCluster
 

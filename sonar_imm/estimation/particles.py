@@ -47,7 +47,7 @@ def normalise(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     best = np.max(log_weights, axis=-1, keepdims=True)
     dead = ~np.isfinite(best)
-    w = np.where(dead, 1.0, np.exp(log_weights - np.where(dead, 0.0, best)))
+    w = np.exp(np.where(dead, 0.0, log_weights - np.where(dead, 0.0, best)))
     total = w.sum(axis=-1, keepdims=True)
     log_sum = np.where(dead, -np.inf, np.where(dead, 0.0, best) + np.log(total))
     return w / total, log_sum[..., 0]

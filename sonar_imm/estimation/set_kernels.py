@@ -134,7 +134,9 @@ def propagate(
             # What is left of the random number within the cell chooses the sign.
             if signs > 1 and point - birth[z + offset] >= birth_positive[z + offset]:
                 negative = 1
-            ratio += birth_ratio[negative, z + offset] + math.log(total)
+            paid = birth_ratio[negative, z + offset] + math.log(total)
+            # Beside a peak of 1e6 sigmas the weights of all free cells can be lost in rounding.
+            ratio += paid if paid < math.inf else -math.inf
             for j in range(m, gap, -1):
                 cell[i, j], sign[i, j] = cell[i, j - 1], sign[i, j - 1]
                 parent[i, j] = parent[i, j - 1]

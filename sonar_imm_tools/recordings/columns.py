@@ -113,6 +113,9 @@ USUAL_NAMES = {
     ),
     'valid': 'position_valid is_valid fix_valid validity gueltig valide valido gyldig',
     'status': 'fix_status position_status zustand etat statut estado',
+    'quality': (
+        'fix_quality position_quality quality_flag qualitaet qualite calidad qualidade kvalitet'
+    ),
     'tag': (
         'tag_id transmitter transmitter_id tx tx_id full_id tagname tag_name '
         'acoustic_tag_id signal sender sender_id sendernummer emetteur transmisor transmissor '

@@ -339,8 +339,15 @@ class _Clock:
         clock = 3600 * hour + 60 * minute + second
         year = np.where((year >= 1) & (year < 100), year + np.where(year < 70, 2000, 1900), year)
         if ((year < 1) | (year > 9999) | (day < 1)).any():
-            return self._undated(clock, questions)
-        date = (year - 1970).astype('datetime64[Y]').astype('datetime64[D]').astype(np.int64)
+            return self._undated(clock, questions, 'the trace headers hold no date')
+        date, end = (
+            each.astype('datetime64[Y]').astype('datetime64[D]').astype(np.int64)
+            for each in (year - 1970, year - 1969)
+        )
+        if (wrong := np.flatnonzero(date + day > end)).size:
+            k = wrong[0]
+            questions.append(f'trace {k + 1} is of day {day[k]} of {year[k]}, which is no date')
+            return self._undated(clock, questions, questions[-1])
         seconds = 86_400 * (date + day - 1) + clock
         base = file.attributes(fields.TimeBaseCode)[:]
         unknown = np.isin(base, (LOCAL, OTHER))
@@ -354,12 +361,12 @@ class _Clock:
         seconds = np.where(base == GPS, seconds - gps_minus_utc(seconds), seconds)
         return _spread(seconds)
 
-    def _undated(self, clock: IntArray, questions: list[str]) -> list[int]:
+    def _undated(self, clock: IntArray, questions: list[str], why: str) -> list[int]:
         """Return stamps from `start` on, by the time of day (T,) s, or evenly without it."""
         if not self.start:
             raise BagError(
-                f'{self.path}: the trace headers hold no date; say when the first trace was '
-                'recorded, --start 2024-05-31T10:00:00Z'
+                f'{self.path}: {why}; say when the first trace was recorded, --start '
+                '2024-05-31T10:00:00Z'
             )
         try:
             start_ns = moment_ns(self.start, lambda: self.time_zone or 'UTC')

@@ -85,6 +85,10 @@ _DECIMAL_COMMA = re.compile(r'[-+]?\d*,(\d{1,2}|\d{4,})$')
 NUMBER = re.compile(r'[-+]?(\d+([.,]\d*)?|[.,]\d+)$')
 _ZERO = re.compile(r'[-+]?0*([.,]0*)?$')
 
+_YES_WORDS, _NO_WORDS = (
+    {word for word in words if len(word) > 1 and word.isalpha()} for words in (YES, NO)
+)
+
 
 @frozen(kw_only=True)
 class CsvOptions:
@@ -196,7 +200,10 @@ class Row:
 
     def require_valid(self) -> None:
         """Raise `BadRow` for a row that the column ``valid``, or ``status`` where it holds words
-        such as OK and error, marks as invalid."""
+        such as OK and error, marks as invalid, or whose ``quality`` is a word such as bad. What
+        other words and numbers say of a quality is not known."""
+        if self.table.has_words('quality') and plain(self.text('quality')) in _NO_WORDS:
+            raise BadRow('the row is flagged as invalid', 'flagged invalid')
         name = 'valid' if self.table.has('valid') or not self.table.has_status else 'status'
         flag = self.text(name).lower()
         if self.table.flags(name) == {'a', 'v'}:  # active and void, as in NMEA
@@ -386,10 +393,11 @@ class Table:
     @functools.cached_property
     def has_status(self) -> bool:
         """Whether the column ``status`` holds words for good or bad, or A and V of NMEA."""
-        words = self.flags('status')
-        return words == {'a', 'v'} or any(
-            word in (*YES, *NO) and len(word) > 1 and word.isalpha() for word in words
-        )
+        return self.flags('status') == {'a', 'v'} or self.has_words('status')
+
+    def has_words(self, name: str) -> bool:
+        """Say whether a column holds words for good or bad."""
+        return not self.flags(name).isdisjoint(_YES_WORDS | _NO_WORDS)
 
     def flags(self, name: str) -> set[str]:
         """Return the words of a column in the rows by which the file is judged."""

@@ -30,7 +30,7 @@ from sonar_imm_tools.recordings.reader import BagReader
 
 TEST = Path(__file__).resolve().parents[1]
 ELSEWHERE = [
-    ('fraction_beside', 'recordings/test_times.py', 'the_fraction_of_a_second_beside'),
+    ('fraction_beside', 'recordings/test_csv_table.py', 'the_fraction_of_a_second_beside'),
     (
         'burst_of_a_second',
         'recordings/convert/test_detections.py',
@@ -52,13 +52,17 @@ ELSEWHERE = [
         'the_date_is_advised_only_where_it_helps',
     ),
     ('hemispheres', 'recordings/test_columns.py', 'degrees_in_every_spelling'),
-    ('hhmmss', 'recordings/test_times.py', 'times_of_day_in_one_number_pass_minutes_and_hours'),
+    (
+        'hhmmss',
+        'recordings/test_csv_table.py',
+        'times_of_day_in_one_number_pass_minutes_and_hours',
+    ),
     (
         'east_zero',
         'recordings/test_columns.py',
         'columns_that_are_zero_throughout_give_way_to_filled_ones',
     ),
-    ('matlab_dates', 'recordings/test_times.py', 'forms_of_dates_and_times'),
+    ('matlab_dates', 'recordings/test_csv_table.py', 'forms_of_dates_and_times'),
     ('zero_zero (target)', 'msg_adapters/test_fixes.py', 'latitude_0_longitude_0_is_no_fix'),
     ('unknown_usbl_type', 'cli/test_info.py', 'a_type_that_nobody_hears_names_what_would_do'),
     ('folder_not_utf8', 'cli/test_names.py', 'any_locale_will_do'),

@@ -385,6 +385,12 @@ def test_normalise_survives_what_underflows_and_nothing_is_uniform():
     w, log_sum = particles.normalise(log_w)
     assert w == pytest.approx([0.25, 0.75, 0.0])
     assert log_sum == pytest.approx(logsumexp(log_w))
+    for unknown in (-np.inf, np.nan, np.inf):
+        w, log_sum = particles.normalise(np.array([[unknown, -1.0, 800.0, -np.inf]] * 2))
+        if np.isneginf(unknown):
+            assert (w == [0.0, 0.0, 1.0, 0.0]).all() and (log_sum == 800.0).all()
+        else:
+            assert (w == 0.25).all() and np.isneginf(log_sum).all()
     w, log_sum = particles.normalise(np.full((2, 4), -np.inf))
     assert (w == 0.25).all() and np.isneginf(log_sum).all()
 

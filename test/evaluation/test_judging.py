@@ -11,14 +11,29 @@
 from importlib import import_module
 import re
 
+from attrs import evolve
 from helpers.dive_bags import write_dive
+from helpers.dive_scenes import single_run
 import numpy as np
 import pytest
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.evaluation import numbers
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions, Limit
+from sonar_imm_tools.evaluation.numbers import (
+    bounds_remark,
+    cards,
+    chi2_summary,
+    coverage_sentence,
+    coverage_verdict,
+    error_summary,
+    lines,
+    Metric,
+    nis_summary,
+    verdict,
+)
 from sonar_imm_tools.offline.run_folder import read_measurements, read_truth, RunFolder
 from sonar_imm_tools.recordings.reader import BagError
 
@@ -27,13 +42,8 @@ def folder_of(tmp_path, estimates=(), **run):
     folder = RunFolder(tmp_path / 'run')
     folder.path.mkdir()
     folder.write_estimates(estimates, 'diver')
-    folder.write_json(
-        'run.json',
-        {
-            'system': 'diver', 'bag': str(tmp_path / 'dive'), 'counts': {},
-            'topics': {'/fix': 'fix'}, 'parameters': {}, **run,
-        },
-    )  # fmt: skip
+    record = {'system': 'diver', 'bag': str(tmp_path / 'dive'), 'topics': {'/fix': 'fix'}}
+    folder.write_json('run.json', {**record, 'counts': {}, 'parameters': {}, **run})
     return folder
 
 
@@ -53,8 +63,6 @@ def test_a_limit_is_met_or_missed():
 
 
 def test_without_truth_there_is_no_accuracy_but_a_page(tmp_path):
-    from helpers.dive_scenes import single_run
-
     judgement = judge(folder_of(tmp_path, single_run(count=30)[0]))
     assert judgement.accuracy(None) is None
     assert 'no truth' in judgement.summary and judgement.metrics['truth_lag_s'] == 0.0
@@ -62,8 +70,6 @@ def test_without_truth_there_is_no_accuracy_but_a_page(tmp_path):
 
 
 def test_truth_of_another_bag_is_scored(tmp_path):
-    from helpers.dive_scenes import single_run
-
     truth = write_dive(tmp_path / 'truth')
     options = JudgeOptions(truth_bag=truth, lag=0.5, gap=5.0, cutoff=3.0)
     judgement = judge(folder_of(tmp_path, single_run(count=100)[0]), options)
@@ -75,12 +81,8 @@ def test_truth_of_another_bag_is_scored(tmp_path):
 
 
 def test_estimates_of_something_else_are_one_sentence(tmp_path):
-    import attrs
-    from helpers.dive_scenes import single_run
-
-    whales = [
-        attrs.evolve(item, state_names=('a', 'b', 'c', 'd')) for item in single_run(count=3)[0]
-    ]
+    divers = single_run(count=3)[0]
+    whales = [evolve(item, state_names=('a', 'b', 'c', 'd')) for item in divers]
     with pytest.raises(BagError, match="no column 'px'"):
         judge(folder_of(tmp_path, whales))
 
@@ -109,3 +111,71 @@ def test_truth_that_is_none_is_refused_by_the_name_of_its_recording(system, tmp_
     monkeypatch.setattr(module, 'read_truth', lambda *_: [nothing])
     with pytest.raises(BagError, match=re.escape(f'{tmp_path / "dive"}: ')):
         judge(folder_of(tmp_path, system=system))
+
+
+# -- numbers that every system is judged by -------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'coverage, words', [(0.6, 'overconfident'), (0.95, 'is consistent'), (1.0, 'more cautious')]
+)
+def test_coverage_is_put_in_words(coverage, words):
+    assert words in coverage_sentence(coverage)
+
+
+def test_a_tracker_with_few_errors_far_too_large_is_overconfident():
+    assert coverage_verdict(0.96, nees=1.9) == 'consistent'
+    assert coverage_verdict(0.96, nees=2.1) == coverage_verdict(1.0, nees=2.1) == 'overconfident'
+    sentence = coverage_sentence(0.96, 31_500.0)
+    assert 'overconfident' in sentence and 'mean NEES 3.15e+04 times' in sentence
+    assert 'NEES' not in coverage_sentence(0.5, 31_500.0)
+    far = chi2_summary(np.array([1.0, 1.0, 126_000.0]), 2)
+    shown = [Metric(covers=('share', 0.95), nees='nees')]
+    assert verdict(shown, {'share': 0.96, 'nees': far}) == 'overconfident'
+    assert verdict(shown, {'share': 0.96}) == 'consistent'
+
+
+def test_lines_name_the_unit_and_are_left_out_without_errors():
+    shown = [numbers.error('angle', 'angle error', 'rad'), numbers.chi2('nees', 'NEES')]
+    angle = error_summary(np.radians([3.0, 4.0]), unit='rad')
+    ((title, value),) = lines(shown, {'angle': angle, 'nees': chi2_summary(np.empty(0), 2)})
+    assert title == 'angle error, RMSE / median / 95 %'
+    assert value == '0.062 / 0.061 / 0.069 rad'
+    assert lines(shown, {'angle': error_summary(np.empty(0), unit='rad')}) == ()
+
+
+def test_a_metric_is_shown_where_its_first_number_is_known():
+    shown = [
+        Metric(label='kept / lost', line='{a.kept:.0%} / {a.lost:.0%}'),
+        Metric(card='Kept', value='{a.kept:.1%}', remark='of {n}', when=lambda m: m['n'] > 1),
+    ]
+    assert lines(shown, {'a': {'kept': 0.5, 'lost': float('nan')}}) == (
+        ('kept / lost', '50 % / -'),
+    )
+    assert lines(shown, {'a': {'lost': 0.5}}) == lines(shown, {}) == ()
+    (card,) = cards(shown, {'n': 2, 'a': {'kept': 0.25}})
+    assert (card.title, card.value, card.remark) == ('Kept', '25.0 %', 'of 2')
+    assert cards(shown, {'n': 1, 'a': {'kept': 0.25}}) == ()
+
+
+def test_nees_leaves_out_what_says_nothing():
+    none = chi2_summary(np.empty(0), 2)
+    assert (none['n'], none['dof'], none['believable']) == (0, 2, None)
+    error = np.array([[3.0, 4.0], [1.0, 1.0], [np.nan, 0.0]])
+    covariance = np.array([np.diag([1.0, 4.0]), np.diag([1.0, 0.0]), np.eye(2)])
+    assert numbers.usable_nees(error, covariance).tolist() == [13.0]
+
+
+def test_mixed_degrees_of_freedom_share_bounds_around_one():
+    summary = nis_summary(np.array([2.0, 4.0]), np.array([2.0, 3.0]))
+    assert summary['mean'] == pytest.approx(6.0 / 5.0) and summary['low'] < 1.0 < summary['high']
+    assert bounds_remark(summary).startswith('per degree of freedom: 1 expected')
+    assert bounds_remark(nis_summary(np.array([2.0]), np.array([2.0]))).endswith('believable')
+    far = bounds_remark(nis_summary(np.full(9, 20.0), np.full(9, 2.0)))
+    assert far.startswith('2 expected; outside of ') and 'believable' not in far
+
+
+def test_the_lines_of_each_number_are_labelled_in_words():
+    shown = numbers.each('height', ['mean_error', 'rmse'])
+    found = lines(shown, {'height': {'mean_error': 0.25, 'rmse': 2}})
+    assert found == (('mean error', '0.25'), ('rmse', '2'))

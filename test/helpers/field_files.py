@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg
 
 from helpers import marine
@@ -30,6 +29,7 @@ from helpers.sonar_files import (
     xtf_head,
     xtf_soundings,
 )
+from msg_adapters.estimates import read_estimate
 from msg_adapters.navigation import write_navigation
 from sonar_imm.measurements import Navigation
 from sonar_imm_tools.recordings.measurements import measurements_of
@@ -270,17 +270,23 @@ def snapshots_npz(path, spots):
     np.savez(path, iq=iq[:, 140:], range=distance[140:], stamp=stamp, **facts)
 
 
-def bag_of(path, spots, messages, types):
+def measured(path, system='diver', topics=None):
+    """What a tracker hears of a recording."""
+    with BagReader(path) as bag:
+        return [item.measurement for item in measurements_of(bag, system, topics)]
+
+
+def truth_of(path):
+    """The true estimates of a recording."""
+    with BagReader(path) as bag:
+        return [read_estimate(item.message) for item in bag.messages(['/truth/estimate'])]
+
+
+def bag_of(path, spots, messages, types=None):
     """A recording; messages: of a spot, (topic, message) each."""
-    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
-        topics = {}
-        for each in spots:
-            stamp = round((FIRST + each.seconds) * 1e9)
-            for topic, message in messages(each, stamp):
-                kind = message.__msgtype__
-                if topic not in topics:
-                    topics[topic] = writer.add_connection(topic, kind, typestore=types)
-                writer.write(topics[topic], stamp, types.serialize_cdr(message, kind))
+    stamps = [round((FIRST + each.seconds) * 1e9) for each in spots]
+    records = ((at, *both) for each, at in zip(spots, stamps) for both in messages(each, at))
+    marine.write_bag(path, records, types)
 
 
 def pose_at(stamp, x):
@@ -315,7 +321,7 @@ def images_bag(path, spots):
             ),
         )
 
-    bag_of(path, spots, messages, marine.typestore())
+    bag_of(path, spots, messages)
 
 
 def phases_bag(path, spots):
@@ -345,7 +351,7 @@ def phases_bag(path, spots):
         yield '/sss/amplitude', image(stamp, np.abs(ping).mean(axis=1), 8)
         yield '/sss/phase', image(stamp, np.angle(ping[:, 1] * ping[:, 0].conj()), 8)
 
-    bag_of(path, spots, messages, marine.typestore())
+    bag_of(path, spots, messages)
 
 
 def cloud_bag(path, spots):
@@ -375,7 +381,7 @@ def cloud_bag(path, spots):
             ),
         )
 
-    bag_of(path, spots, messages, types)
+    bag_of(path, spots, messages)
 
 
 def side_scan_xtf(path, spots):

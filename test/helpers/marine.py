@@ -12,6 +12,7 @@ bag brings along: those of marine_acoustic_msgs, and of single drivers and simul
 from functools import cache
 
 import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 PACKAGE = 'marine_acoustic_msgs/msg/'
@@ -198,9 +199,27 @@ def sent(message):
     return types.deserialize_cdr(bytes(types.serialize_cdr(message, name)), name)
 
 
+def write_bag(path, records, types=None):
+    """A bag of (log time in ns, topic, message) as its recorder writes it: in the order of their
+    times, with the definitions of their types."""
+    types = types or typestore()
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        links = {}
+        for log_ns, topic, message in sorted(records, key=lambda record: record[0]):
+            name = message.__msgtype__
+            if topic not in links:
+                links[topic] = writer.add_connection(topic, name, typestore=types)
+            writer.write(links[topic], log_ns, types.serialize_cdr(message, name))
+    return path
+
+
 def driver_message(name, **values):
     """A message with the fields `values`, by dotted names (``position.latitude``); others zero."""
-    message = _zero(name)
+    return put(_zero(name), **values)
+
+
+def put(message, **values):
+    """The message, with other values of these fields, of any kind."""
     for path, value in values.items():
         *way, last = path.split('__')
         target = message

@@ -42,21 +42,20 @@ def test_no_message_breaks_a_tracker(system):
 
 
 @pytest.mark.parametrize(
-    'bad',
+    'system, variant, numbers',
     [
-        {3: 1048575, 15: 11047, 19: 257408},
-        {2: 297, 3: 20451, 7: 1633},
+        ('diver', 3, {3: 1048575, 15: 11047, 19: 257408}),  # existence above 1
+        ('diver', 3, {2: 297, 3: 20451, 7: 1633}),  # the same, of one
+        ('fathometer', 0, {2: 146, 9: 300657}),  # a record that no set explains
+        # Births where all free cells have lost their weight.
+        ('fathometer', 2, {7: 1188873, 10: 33531}),
+        ('fathometer', 0, {18: 3606393, 35: 93705795}),
+        ('fathometer', 0, {7: 9, 37: 75}),  # all cells are within the aperture
+        ('fathometer', 0, {49: 230133}),  # an echo narrower than any pulse
     ],
-    ids=['existence above 1', 'existence of one above 1'],
 )
-def test_messages_that_once_broke_the_existence_of_divers(bad):
-    numbers = [bad.get(k, 0) for k in range(50)]
-    run('diver', (3, [Bad.of('diver', number) for number in numbers]))
-
-
-def test_a_record_that_no_set_explains_is_no_warning_of_numpy():
-    numbers = {2: 146, 9: 300657}
-    run('fathometer', (0, [Bad.of('fathometer', numbers.get(k, 0)) for k in range(50)]))
+def test_messages_that_once_broke_a_tracker(system, variant, numbers):
+    run(system, (variant, [Bad.of(system, numbers.get(k, 0)) for k in range(50)]))
 
 
 def test_where_the_last_diver_has_gone_existence_is_a_number_still():

@@ -18,15 +18,19 @@ import pytest
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.intake import Intake
+from sonar_imm.intake import Intake, KnownFrames, MOST_FRAMES, moved, TransformTree
 from sonar_imm.measurements import (
     Altitude,
+    ArrayDepth,
+    Detections,
     Fix,
     Fixes,
     Navigation,
     NOBODY,
     Rejection,
+    RelativeFix,
     Snapshot,
+    Start,
     StaticTransforms,
 )
 from sonar_imm.parameters import ConfigError
@@ -88,6 +92,8 @@ def test_a_mounting_that_transforms_say_is_that_of_the_parameters(system):
 
 @pytest.mark.parametrize('system', ['obstacle', 'bathymetry'])
 def test_pings_before_the_mounting_is_known_are_refused_by_name(system):
+    with pytest.raises(ConfigError, match='need each other'):
+        SYSTEMS[system].config_type()(sonar_frame='sonar')
     last, refused, _ = run(system, **FRAMES)
     assert last is None and {item.reason for item in refused} == {'no_mounting'}
     assert "'sonar' is on 'base_link'" in refused[0].sentence
@@ -100,12 +106,6 @@ def test_a_change_of_parameters_keeps_the_mounting():
     intake.admit(TRANSFORMS)
     intake.reconfigure(evolve(config, detection_probability=0.5))
     assert tracker.config.detection_probability == 0.5 and tracker.config.sonar_lever == LEVER
-
-
-@pytest.mark.parametrize('system', ['obstacle', 'bathymetry'])
-def test_one_frame_alone_is_a_mistake(system):
-    with pytest.raises(ConfigError, match='need each other'):
-        SYSTEMS[system].config_type()(sonar_frame='sonar')
 
 
 def fix(frame_id, x):
@@ -150,14 +150,9 @@ def test_a_late_altitude_does_not_shut_out_the_later_ones():
         altitude = Altitude(stamp_ns=second * 10**9, altitude=9.0, frame_id=frame_id)
         tracker.process(intake.admit(altitude))
 
+    level = {'position': [0.0, 0.0, 0.0], 'orientation': [0.0, 0.0, 0.0, 1.0], 'frame_id': 'map'}
     for second in range(5000, 5005):
-        pose = Navigation(
-            stamp_ns=second * 10**9,
-            position=[0.0, 0.0, 0.0],
-            orientation=[0.0, 0.0, 0.0, 1.0],
-            frame_id='map',
-        )
-        tracker.process(intake.admit(pose))
+        tracker.process(intake.admit(Navigation(stamp_ns=second * 10**9, **level)))
     take(4000, 'another')
     assert tracker.counts['too_late'] == 1
     take(5005, 'altimeter')
@@ -171,11 +166,12 @@ def test_a_required_frame_survives_a_reset_and_a_first_one_does_not():
     for required in ('', 'map'):
         intake = Intake(tracker, required)
         tracker.process(intake.admit(fix('map', 1.0)))
-        with pytest.raises(Rejection, match="'odom' is not the frame 'map' of the tracks"):
+        refused = pytest.raises(Rejection, match="'odom' is not the frame 'map' of the tracks")
+        with refused:
             intake.admit(fix('odom', 2.0))
         intake.reset()
         if required:
-            with pytest.raises(Rejection, match="'odom' is not the frame 'map' of the tracks"):
+            with refused:
                 intake.admit(fix('odom', 2.0))
         else:
             assert intake.admit(fix('odom', 2.0)).frame_id == 'odom'
@@ -183,9 +179,7 @@ def test_a_required_frame_survives_a_reset_and_a_first_one_does_not():
 
 def test_an_array_keeps_to_its_first_frame():
     scene, received = scene_of('bathymetry')
-    snapshot = next(
-        item.measurement for item in received if isinstance(item.measurement, Snapshot)
-    )
+    snapshot = next(x.measurement for x in received if isinstance(x.measurement, Snapshot))
     config = SYSTEMS['bathymetry'].config_type()(**scene.instruments())
     intake = Intake(SYSTEMS['bathymetry'].build(config))
     first = evolve(snapshot, frame_id='array')
@@ -203,22 +197,13 @@ def wandering(k, rng):
     yield evolve(fix('map', place[0]), stamp_ns=stamp_ns, target_id=k, sensor=f'usbl_{k}')
     yield evolve(fix(f'sonar_{k}', place[1]), stamp_ns=stamp_ns)
     yield Fixes(
-        stamp_ns=stamp_ns,
-        frame_id=f'sonar_{k}',
-        sensor=f'sonar_{k}',
-        position=place + rng.normal(size=(3, 3)),
-        target_id=[k, 10**6 + k, NOBODY],
-    )
-    for passive in (False, True):
-        yield arrivals(
-            stamp_ns,
-            rx,
-            (1.0 + (not passive)) * np.linalg.norm(rx - place, axis=1) / 1500.0,
-            tx_id=np.full(4, k),
-            rx_id=4 * k + np.arange(4),
-            tx=np.full((4, 3), np.nan) if passive else rx[[0, 0, 0, 0]],
-            var_toa=1e-07,
-        )
+        stamp_ns=stamp_ns, frame_id=f'sonar_{k}', sensor=f'sonar_{k}',
+        position=place + rng.normal(size=(3, 3)), target_id=[k, 10**6 + k, NOBODY],
+    )  # fmt: skip
+    time = np.linalg.norm(rx - place, axis=1) / 1500.0
+    names = {'tx_id': np.full(4, k), 'rx_id': 4 * k + np.arange(4), 'var_toa': 1e-07}
+    yield arrivals(stamp_ns, rx, 2.0 * time, tx=rx[[0, 0, 0, 0]], **names)
+    yield arrivals(stamp_ns, rx, time, tx=np.full((4, 3), np.nan), **names)
 
 
 def entries(value):
@@ -243,3 +228,204 @@ def test_a_tracker_does_not_grow_with_names_that_wander():
                 intake.tracker.process(admitted)
         sizes.append(entries(frozen_state(intake.tracker)))
     assert max(sizes[30:]) <= max(sizes[:30])
+
+
+# -- the tree of frames, and measurements turned from one into another ----------------------------
+
+STAMP = 10**9
+YAW = 0.7
+TURNED = Pose(np.array([10.0, -20.0, 3.0]), geometry.rotation(0.0, 0.0, YAW))
+
+
+def a_pose(rng):
+    return Pose(rng.normal(size=3), geometry.rotation(*rng.uniform(-1.5, 1.5, size=3)))
+
+
+def matrix(pose):
+    """Homogeneous: an independent way to write the same."""
+    whole = np.eye(4)
+    whole[:3, :3], whole[:3, 3] = pose.R, pose.position
+    return whole
+
+
+def test_a_chain_of_transforms_is_the_product_of_its_matrices():
+    rng = np.random.default_rng(3)
+    a, b, c, d = (a_pose(rng) for _ in range(4))
+    tree = TransformTree()
+    tree.add(StaticTransforms(poses={'base': ('map', a), 'arm': ('base', b)}))
+    tree.add(StaticTransforms(poses={'sonar': ('arm', c), 'keel': ('base', d)}))
+    A, B, C, D = (matrix(pose) for pose in (a, b, c, d))
+    for target, source, expected in (
+        ('map', 'sonar', A @ B @ C),
+        ('sonar', 'map', np.linalg.inv(A @ B @ C)),
+        ('keel', 'sonar', np.linalg.inv(D) @ B @ C),
+        ('base', 'sonar', B @ C),
+        ('base', 'base', np.eye(4)),
+    ):
+        assert matrix(tree.pose(target, source)) == pytest.approx(expected, abs=1e-12)
+    assert tree.pose('map', 'elsewhere') is None and tree.pose('elsewhere', 'map') is None
+
+
+def test_what_is_said_again_replaces_and_a_loop_ends():
+    tree = TransformTree()
+    near, far = (Pose(np.array([x, 0.0, 0.0]), np.eye(3)) for x in (1.0, 2.0))
+    tree.add(StaticTransforms(poses={'a': ('b', near), 'b': ('a', near)}))
+    assert tree.pose('nowhere', 'a') is None
+    tree.add(StaticTransforms(poses={'a': ('c', far), 'b': ('c', near)}))
+    assert tree.pose('c', 'a').position.tolist() == [2.0, 0.0, 0.0]
+
+
+def check_turned(before, after, variance_before, variance_after):
+    """Points and covariances, against the homogeneous matrix and the turn of samples."""
+    whole = matrix(TURNED) @ np.append(before, 1.0)
+    assert after == pytest.approx(whole[:3], abs=1e-12)
+    R = np.array([[np.cos(YAW), -np.sin(YAW)], [np.sin(YAW), np.cos(YAW)]])
+    assert variance_after == pytest.approx(R @ variance_before @ R.T, abs=1e-12)
+
+
+def test_positions_are_turned_with_their_covariances():
+    covariance = np.array([[4.0, 1.0], [1.0, 9.0]])
+    for kind in (Fix, Start):
+        place = kind(stamp_ns=STAMP, position=[1.0, 2.0, 3.0], covariance=covariance, frame_id='a')
+        made = moved(place, 'map', TURNED)
+        assert made.frame_id == 'map' and made.stamp_ns == STAMP
+        check_turned(place.position, made.position, covariance, made.covariance[:2, :2])
+    assert moved(Fix(stamp_ns=1, position=[0.0, 0.0, 0.0]), 'map', TURNED).covariance is None
+    whole = np.array([[4.0, 1.0, 0.5], [1.0, 9.0, -0.4], [0.5, -0.4, 0.25]])
+    made = moved(Fix(stamp_ns=1, position=[0.0, 0.0, 0.0], covariance=whole), 'map', TURNED)
+    assert made.covariance == pytest.approx(TURNED.R @ whole @ TURNED.R.T, abs=1e-12)
+    unknown = np.full((2, 2), np.nan)
+    places = [[1.0, 2.0, 3.0], [5.0, 6.0, 0.0]]
+    scan = Fixes(stamp_ns=STAMP, position=places, covariance=np.array([covariance, unknown]))
+    made = moved(scan, 'map', TURNED)
+    check_turned(scan.position[0], made.position[0], covariance, made.covariance[0, :2, :2])
+    assert np.isnan(made.covariance[1]).all()
+
+
+def test_arrivals_are_turned_with_their_bearings():
+    rx, seen = np.array([[0.0, 0.0, 0.0], [50.0, 0.0, -2.0]]), np.array([3.0, np.nan])
+    more = {'tx': np.ones((2, 3)), 'bearing': seen, 'var_bearing': 0.01}
+    ping = arrivals(STAMP, rx, np.full(2, 0.05), **more)
+    made = moved(ping, 'map', TURNED)
+    for k in range(2):
+        check_turned(ping.rx[k], made.rx[k], np.eye(2), np.eye(2))
+    assert made.bearing[0] == pytest.approx(3.0 + YAW - 2.0 * np.pi) and np.isnan(made.bearing[1])
+
+
+def test_navigation_is_turned_as_its_pose_is():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(6, 6))
+    quaternion = rng.normal(size=4)
+    navigation = Navigation(
+        stamp_ns=STAMP, position=[1.0, 2.0, 3.0], velocity=[1.0, 0.5, 0.1], frame_id='odom',
+        orientation=quaternion / np.linalg.norm(quaternion), pose_covariance=root @ root.T,
+    )  # fmt: skip
+    made = moved(navigation, 'map', TURNED)
+    before = geometry.rotation_of_quaternion(navigation.orientation)
+    after = geometry.rotation_of_quaternion(made.orientation)
+    assert after == pytest.approx(TURNED.R @ before, abs=1e-12)
+    assert made.velocity.tolist() == [1.0, 0.5, 0.1]
+    for part in (slice(0, 3), slice(3, 6)):
+        block = TURNED.R @ navigation.pose_covariance[part, part] @ TURNED.R.T
+        assert made.pose_covariance[part, part] == pytest.approx(block, abs=1e-9)
+    assert made.position == pytest.approx((matrix(TURNED) @ [1.0, 2.0, 3.0, 1.0])[:3])
+
+
+def test_a_tilted_frame_and_what_a_sonar_sees_are_refused_with_both_names():
+    tilted = Pose(np.zeros(3), geometry.rotation(0.1, 0.0, 0.0))
+    placed = Fix(stamp_ns=STAMP, position=[0.0, 0.0, 0.0], frame_id='deck')
+    with pytest.raises(Rejection, match="'deck' is tilted against 'map'"):
+        moved(placed, 'map', tilted)
+    ping = Detections(stamp_ns=STAMP, range=[1.0], bearing=[0.0], frame_id='sonar')
+    with pytest.raises(Rejection, match="'sonar'"):
+        moved(ping, 'map', TURNED)
+
+
+def test_what_sensors_on_board_measure_is_turned_into_the_axes_of_the_first_one():
+    echo = Detections(stamp_ns=STAMP, range=[5.0], bearing=[3.0], frame_id='skewed')
+    here = Pose(np.zeros(3), TURNED.R)
+    made = moved(echo, 'sonar', here)
+    assert made.frame_id == 'sonar' and made.range.tolist() == [5.0]
+    assert made.bearing == pytest.approx([3.0 + YAW - 2.0 * np.pi])
+    with pytest.raises(Rejection, match="'skewed' is another one, at another place"):
+        moved(echo, 'sonar', TURNED)
+
+    height = Altitude(stamp_ns=STAMP, altitude=9.0, variance=0.04, frame_id='altimeter')
+    made = moved(height, 'dvl', TURNED)
+    assert (made.altitude, made.variance, made.frame_id) == (6.0, 0.04, 'dvl')
+
+    tilted = Pose(np.array([2.0, 0.5, -1.0]), geometry.rotation(0.3, -0.4, 0.9))
+    covariance = np.diag([1.0, 4.0, 9.0])
+    placed = RelativeFix(
+        stamp_ns=STAMP, offset=[9.0, 2.0, -4.0], covariance=covariance, frame_id='b'
+    )
+    made = moved(placed, 'usbl', tilted)
+    assert made.offset == pytest.approx((matrix(tilted) @ [9.0, 2.0, -4.0, 1.0])[:3])
+    assert made.covariance == pytest.approx(tilted.R @ covariance @ tilted.R.T)
+    level = RelativeFix(stamp_ns=STAMP, offset=[9.0, 2.0, -4.0], levelled=True, frame_id='b')
+    made = moved(level, 'usbl', Pose(np.zeros(3), tilted.R))
+    assert made.offset.tolist() == [9.0, 2.0, -4.0] and made.frame_id == 'usbl'
+    with pytest.raises(Rejection, match='do not say how the vessel lies'):
+        moved(level, 'usbl', tilted)
+
+
+def test_frames_whose_names_wander_are_forgotten_and_those_said_again_are_not():
+    tree, step = TransformTree(), Pose(np.ones(3), np.eye(3))
+    for k in range(3 * MOST_FRAMES):
+        tree.add(StaticTransforms(stamp_ns=STAMP, poses={f'f{k}': (f'f{k - 1}', step)}))
+        if k % 100 == 0:
+            tree.add(StaticTransforms(stamp_ns=STAMP, poses={'sonar': ('hull', step)}))
+    assert len(tree._poses) == MOST_FRAMES
+    assert tree.pose('hull', 'sonar') is not None
+    assert tree.pose('f0', 'f1') is None
+    assert tree.pose(f'f{3 * MOST_FRAMES - 2}', f'f{3 * MOST_FRAMES - 1}') is not None
+
+
+# One frame for one tracker.
+
+
+def placed(frame_id):
+    return Fix(stamp_ns=1, position=(0.0, 0.0, 0.0), frame_id=frame_id)
+
+
+def test_the_first_named_frame_stays():
+    frames = KnownFrames()
+    frames.admit(placed(''))
+    frames.admit(placed('map'))
+    frames.admit(placed('map'))
+    with pytest.raises(Rejection) as caught:
+        frames.admit(placed('odom'))
+    assert caught.value.reason == 'frame'
+    assert caught.value.sentence == "the frame 'odom' is not the frame 'map' of the tracks"
+    with pytest.raises(Rejection):
+        frames.admit(placed(''))
+    # A depth is one in any frame.
+    frames.admit(ArrayDepth(stamp_ns=1, depth=30.0, frame_id='buoy'))
+    assert frames.frame_id == 'map'
+
+
+def test_a_required_frame_holds_before_any_is_known():
+    frames = KnownFrames()
+    with pytest.raises(Rejection, match="'map' is not the frame 'harbour' of the tracks"):
+        frames.check(placed('map'), 'harbour')
+    with pytest.raises(Rejection, match="'' is not the frame 'harbour' of the tracks"):
+        frames.check(placed(''), 'harbour')
+    frames.check(placed('harbour'), 'harbour')
+    frames.check(Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter'), 'harbour')
+    assert frames.frame_id == ''
+
+
+def test_what_sensors_on_board_say_is_in_frames_of_their_own():
+    frames = KnownFrames()
+    echo = Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar')
+    height = Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter')
+    place = Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='odom')
+    for measurement in (echo, height, place, echo, height, place):
+        frames.admit(measurement)
+    for other in (
+        Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'),
+        Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='map'),
+    ):
+        with pytest.raises(Rejection) as caught:
+            frames.admit(other)
+        assert caught.value.reason == 'frame'

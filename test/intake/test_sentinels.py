@@ -23,12 +23,7 @@ from msg_adapters.fixes import (
     write_geodetic,
     write_relative,
 )
-from msg_adapters.navigation import (
-    read_heading,
-    read_vessel_pose,
-    write_heading,
-    write_navigation,
-)
+from msg_adapters.navigation import read_heading, read_vessel_pose, write_heading, write_navigation
 from msg_adapters.scans import read_scan, write_scan
 from sonar_imm.acoustics.geometry import Pose, rotation
 from sonar_imm.intake import Intake, moved
@@ -68,23 +63,14 @@ def pose_of_fix(variance):
     return read_fix(variances(write_fix(fix, ros_message), *[variance] * 6))
 
 
-def of_satellites(kind):
-    def read(variance):
-        message = write_geodetic(
-            GeodeticFix(stamp_ns=S, latitude=59.0, longitude=10.0), ros_message
-        )
+def of_satellites(of, read, kind):
+    def read_with(variance):
+        message = write_geodetic(of(stamp_ns=S, latitude=59.0, longitude=10.0), ros_message)
         message.position_covariance[:] = np.diag(np.full(3, variance)).ravel()
         message.position_covariance_type = kind
-        return read_geodetic(message)
+        return read(message)
 
-    return read
-
-
-def of_vessel(variance):
-    message = write_geodetic(VesselFix(stamp_ns=S, latitude=59.0, longitude=10.0), ros_message)
-    message.position_covariance[:] = np.diag(np.full(3, variance)).ravel()
-    message.position_covariance_type = 2
-    return read_vessel_fix(message)
+    return read_with
 
 
 def of_transceiver(variance):
@@ -94,12 +80,9 @@ def of_transceiver(variance):
 
 def row_of_scan(variance):
     """A row of a table of fixes, beside a good one."""
-    scan = Fixes(
-        stamp_ns=S,
-        position=np.array([[1.0, 2.0, 0.0], [5.0, 5.0, 0.0]]),
-        covariance=np.stack([np.diag([4.0, 4.0, np.nan]), np.eye(3)]),
-        frame_id='map',
-    )
+    places = np.array([[1.0, 2.0, 0.0], [5.0, 5.0, 0.0]])
+    stated = np.stack([np.diag([4.0, 4.0, np.nan]), np.eye(3)])
+    scan = Fixes(stamp_ns=S, position=places, covariance=stated, frame_id='map')
     message = write_scan(scan, ros_message)
     names = [field.name for field in message.fields]
     rows = np.array(message.data).reshape(2, message.point_step)
@@ -117,9 +100,9 @@ def row_of_scan(variance):
 
 ROADS = {
     'PoseWithCovarianceStamped': pose_of_fix,
-    'NavSatFix diagonal': of_satellites(2),
-    'NavSatFix known': of_satellites(3),
-    'NavSatFix of the vessel': of_vessel,
+    'NavSatFix diagonal': of_satellites(GeodeticFix, read_geodetic, 2),
+    'NavSatFix known': of_satellites(GeodeticFix, read_geodetic, 3),
+    'NavSatFix of the vessel': of_satellites(VesselFix, read_vessel_fix, 2),
     'relative': of_transceiver,
     'row of a table': row_of_scan,
 }
@@ -146,9 +129,8 @@ def test_one_axis_that_is_far_from_known_is_used():
 
 
 def odometry(second, *diagonal):
-    pose = VesselPose(
-        stamp_ns=round(second * S), position=(0.0, 0.0, 0.0), orientation=STOOD, frame_id='odom'
-    )
+    place = {'position': (0.0, 0.0, 0.0), 'orientation': STOOD, 'frame_id': 'odom'}
+    pose = VesselPose(stamp_ns=round(second * S), **place)
     return read_vessel_pose(variances(write_navigation(pose, ros_message), *diagonal))
 
 
@@ -164,14 +146,10 @@ def seen(read, *diagonal, config=None):
     """The tracker after a relative fix of a vessel with these variances, and its estimate."""
     tracker = DiverTracker(config or DiverConfig(covariance_scales=(1.0,)))
     intake, made = Intake(tracker), []
-    covariance = 0.25 * np.eye(3)
     for second in (4, 6):
         if read is by_heading:
-            made.append(
-                VesselFix(
-                    stamp_ns=second * S, latitude=59.0, longitude=10.0, covariance=covariance
-                )
-            )
+            place = {'latitude': 59.0, 'longitude': 10.0, 'covariance': 0.25 * np.eye(3)}
+            made.append(VesselFix(stamp_ns=second * S, **place))
         made.append(read(second, *diagonal))
     made.append(RelativeFix(stamp_ns=5 * S, offset=(100.0, 0.0, -20.0), frame_id='usbl'))
     rows = [row for item in made for row in tracker.process(intake.admit(item))]

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The streams that every tracker stands on, with measurements of three lines."""
+"""The streams that every tracker stands on, with measurements of three lines; repeats, leaps."""
 
 import pickle
 
@@ -15,8 +15,17 @@ import numpy as np
 import pytest
 
 from sonar_imm.intake import RepeatFilter
+from sonar_imm.intake.leaps import LeapFilter
 from sonar_imm.intake.stream import Admitted, OnceStream, ReplayStream, StreamRules
-from sonar_imm.measurements import Fix, Fixes, GeodeticFix, Rejection, RelativeFix, VesselFix
+from sonar_imm.measurements import (
+    Fix,
+    Fixes,
+    GeodeticFix,
+    Navigation,
+    Rejection,
+    RelativeFix,
+    VesselFix,
+)
 from sonar_imm.trackers.shared_parameters import StampParameters, StreamParameters
 
 S = 10**9
@@ -145,21 +154,14 @@ def test_what_was_held_is_in_one_frame_after_a_restart():
 # Repeated polls are left out, and nothing else.
 
 
-SECOND = 10**9
-
-
 def fix(second, x=1.0, **values):
-    return Fix(
-        stamp_ns=round(second * SECOND), position=(x, 0.0, 0.0), **{'frame_id': 'map', **values}
-    )
+    values = {'frame_id': 'map', **values}
+    return Fix(stamp_ns=round(second * S), position=(x, 0.0, 0.0), **values)
 
 
 def scan(second, *places, **values):
-    return Fixes(
-        stamp_ns=round(second * SECOND),
-        position=np.reshape([(x, 0.0, 0.0) for x in places], (-1, 3)),
-        **values,
-    )
+    position = np.reshape([(x, 0.0, 0.0) for x in places], (-1, 3))
+    return Fixes(stamp_ns=round(second * S), position=position, **values)
 
 
 def passes(repeats, measurement):
@@ -172,34 +174,26 @@ def passes(repeats, measurement):
 
 
 def test_the_same_position_a_moment_later_is_a_repeat_until_the_time_is_over():
+    """A late one too; the same stamp is left to others."""
     repeats = RepeatFilter(5.0)
     passed = [passes(repeats, fix(second)) for second in (1, 2, 3, 6, 6.5, 7, 12)]
     assert passed == [True, False, False, False, True, False, True]
-
-
-def test_a_late_repeat_is_one_too_and_the_same_stamp_is_left_to_others():
     repeats = RepeatFilter(5.0)
     assert passes(repeats, fix(10)) and passes(repeats, fix(10)) and not passes(repeats, fix(8))
 
 
 def test_other_numbers_names_sensors_and_frames_are_no_repeats():
     repeats = RepeatFilter(5.0)
-    others = [
-        fix(1),
-        fix(2, x=1.0000001),
-        fix(2, target_id=4),
-        fix(2, sensor='usbl'),
-        fix(2, frame_id='odom'),
-        fix(2, covariance=np.eye(2)),
-    ]
-    assert all(passes(repeats, other) for other in others)
+    others = {'x': 1.0000001, 'target_id': 4, 'sensor': 'usbl', 'frame_id': 'odom'}
+    assert passes(repeats, fix(1)) and passes(repeats, fix(2, covariance=np.eye(2)))
+    assert all(passes(repeats, fix(2, **{name: value})) for name, value in others.items())
 
 
 @pytest.mark.parametrize(
     'make',
     [
-        lambda k: GeodeticFix(stamp_ns=k * SECOND, latitude=59.0, longitude=10.0),
-        lambda k: RelativeFix(stamp_ns=k * SECOND, offset=(1.0, 2.0, 3.0)),
+        lambda k: GeodeticFix(stamp_ns=k * S, latitude=59.0, longitude=10.0),
+        lambda k: RelativeFix(stamp_ns=k * S, offset=(1.0, 2.0, 3.0)),
         lambda k: scan(k, 1.0, 2.0),
     ],
 )
@@ -212,7 +206,7 @@ def test_an_empty_scan_and_a_vessel_at_rest_are_no_repeats():
     repeats = RepeatFilter(5.0)
     for k in range(1, 4):
         assert passes(repeats, scan(k))
-        assert passes(repeats, VesselFix(stamp_ns=k * SECOND, latitude=59.0, longitude=10.0))
+        assert passes(repeats, VesselFix(stamp_ns=k * S, latitude=59.0, longitude=10.0))
 
 
 def test_of_named_positions_the_new_ones_stay():
@@ -233,14 +227,8 @@ def held(count, period, std, digits, seed=1, speed=0.4):
         new = k % period == 0
         if new:
             place = np.round((speed * k, 3.0) + std * rng.normal(size=2), digits)
-        yield (
-            Fix(
-                stamp_ns=(1 + k) * SECOND,
-                position=(*place, 0.0),
-                covariance=std**2 * np.eye(2),
-            ),
-            new,
-        )
+        known = {'position': (*place, 0.0), 'covariance': std**2 * np.eye(2)}
+        yield Fix(stamp_ns=(1 + k) * S, **known), new
 
 
 @pytest.mark.parametrize('period', [2, 7, 10, 12])
@@ -260,7 +248,7 @@ def test_named_rows_and_latitudes_are_held_too():
         both = scan(1 + k, x, float(k), target_id=[4, 5])
         rows = repeats.fresh(both).target_id.tolist()
         degrees = {'latitude': 59.0 + 1e-5 * x, 'longitude': 10.0 + 1e-5 * y}
-        used = passes(geodetic, GeodeticFix(stamp_ns=(1 + k) * SECOND, **degrees))
+        used = passes(geodetic, GeodeticFix(stamp_ns=(1 + k) * S, **degrees))
         assert k < 10 or (used == new and rows == ([4, 5] if new else [5]))
 
 
@@ -270,7 +258,7 @@ def test_a_frozen_value_of_fine_digits_is_no_fix_however_old():
         repeats, last = RepeatFilter(5.0), None
         for last, _ in held(60, 5, std, digits, speed=0.2):
             passes(repeats, last)
-        frozen = [evolve(last, stamp_ns=(61 + k) * SECOND) for k in range(60)]
+        frozen = [evolve(last, stamp_ns=(61 + k) * S) for k in range(60)]
         assert sum(passes(repeats, item) for item in frozen) >= due
         assert due or not any(passes(repeats, item) for item in frozen)
 
@@ -283,7 +271,7 @@ def test_a_degree_of_longitude_is_short_in_the_north(latitude, std, fine):
     repeats, degrees = RepeatFilter(5.0), {'latitude': latitude, 'covariance': std**2 * np.eye(3)}
 
     def at(k, longitude):
-        return GeodeticFix(stamp_ns=(1 + k) * SECOND, longitude=longitude, **degrees)
+        return GeodeticFix(stamp_ns=(1 + k) * S, longitude=longitude, **degrees)
 
     for k in range(60):
         passes(repeats, at(k, 10.0 + 1e-5 * (k // 5)))
@@ -315,3 +303,67 @@ def test_what_is_remembered_of_a_scan_is_as_short_as_of_a_position():
         assert passes(repeats, scan(k, *(k + 1e-3 * np.arange(1000)), frame_id='f' * 1000))
     assert not passes(repeats, scan(101, *(99 + 1e-3 * np.arange(1000)), frame_id='f' * 1000))
     assert len(pickle.dumps(repeats)) < 10_000
+
+
+# -- a vessel is not where it cannot have come to -------------------------------------------------
+
+
+def believed(positions, kind='metres', period=0.5, filter=None):
+    """Which of the positions, one each `period` s, pass."""
+    filter = filter or LeapFilter()
+    found = []
+    for k, (x, y) in enumerate(positions):
+        stamp_ns = 1000 * S + round(k * period * S)
+        if kind == 'earth':
+            place = {'latitude': y, 'longitude': x, 'height': 0.0, 'frame_id': 'gps'}
+            measured = VesselFix(stamp_ns=stamp_ns, **place)
+        else:
+            place = {'position': (x, y, 0.0), 'orientation': (0.0, 0.0, 0.0, 1.0)}
+            measured = Navigation(stamp_ns=stamp_ns, frame_id='odom', **place)
+        try:
+            filter.check(measured)
+            found.append(True)
+        except Rejection as refusal:
+            assert refusal.reason == 'leap'
+            found.append(False)
+    return found
+
+
+@pytest.mark.parametrize('far', [1200.0, 4e4, 5e6])
+def test_a_leap_of_a_moment_is_refused(far):
+    way = [(2.0 * k, 0.0) for k in range(10)]
+    way[4] = (8.0, far)
+    assert believed(way) == [k != 4 for k in range(10)]
+
+
+def test_a_vessel_that_stays_where_it_leapt_is_believed_after_two_seconds():
+    way = [(0.0, 0.0)] * 3 + [(9e4, 0.5 * k) for k in range(10)]
+    assert believed(way) == [True] * 3 + [False] * 4 + [True] * 6
+    assert believed(way, period=2.0) == [True] * 3 + [False] * 2 + [True] * 8
+
+
+def test_two_vessels_in_turn_are_one_and_the_other_refused():
+    way = [(0.0, 0.0), (5e5, 0.0)] * 10
+    assert believed(way) == [True, False] * 10
+
+
+def test_fast_enough_is_no_leap():
+    assert all(believed([(95.0 * k, 0.0) for k in range(50)], period=1.0))
+    assert all(believed([(0.0, 0.0), (80e3, 0.0)], period=1000.0))
+
+
+def test_positions_on_earth_across_the_date_line():
+    way = [((179.9999 + 2e-5 * k + 180.0) % 360.0 - 180.0, -17.0) for k in range(12)]
+    assert min(x for x, _ in way) < 0.0 and all(believed(way, 'earth'))
+    way[5] = (0.1, 51.0)
+    assert believed(way, 'earth') == [k != 5 for k in range(12)]
+
+
+def test_vessels_in_other_frames_and_targets_are_not_asked():
+    filter = LeapFilter()
+    assert believed([(0.0, 0.0)], filter=filter) == [True]
+    assert believed([(9.0, 54.0)], 'earth', filter=filter) == [True]
+    for x in (0.0, 1e6):
+        filter.check(Fix(stamp_ns=1000 * S, position=(x, 0.0, 0.0), frame_id='odom'))
+    filter.reset()
+    assert believed([(1e6, 0.0)], filter=filter) == [True]

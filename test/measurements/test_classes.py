@@ -6,13 +6,34 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What all measurement classes have in common."""
+"""What measurements refuse, what they keep and what they mask."""
+
+import contextlib
 
 import attrs
+import numpy as np
 import pytest
 
 from sonar_imm import measurements
-from sonar_imm.measurements import check_stamp, Rejection
+from sonar_imm.measurements import (
+    ArrayDepth,
+    check_stamp,
+    CrossSpectra,
+    Fix,
+    Fixes,
+    GeodeticFix,
+    MAX_BINS,
+    Navigation,
+    Pressure,
+    Rejection,
+    RelativeFix,
+    Snapshot,
+    Start,
+    Trace,
+    VesselHeading,
+    VesselPose,
+)
+from sonar_imm.measurements.variances import by_axis, check_flat, filled, UNKNOWN_VARIANCE
 
 CLASSES = [
     kind
@@ -29,13 +50,376 @@ def test_a_measurement_is_made_by_names_and_is_equal_to_itself_alone(kind):
     assert kind.__setattr__ is not object.__setattr__  # frozen
 
 
-@pytest.mark.parametrize('stamp_ns', [0, -1, 2**31 * 10**9, 2**62, 2**63, 2**80])
-def test_a_stamp_that_is_no_time_of_ros_is_refused_by_name(stamp_ns):
-    with pytest.raises(Rejection, match=f'the header stamp is {stamp_ns} ns') as caught:
-        check_stamp(stamp_ns)
-    assert caught.value.reason == 'bad_stamp'
-
-
-def test_the_last_stamp_of_ros_is_one():
+def test_a_stamp_that_is_no_time_of_ros_is_refused_by_name():
+    for stamp_ns in (0, -1, 2**31 * 10**9, 2**62, 2**63, 2**80):
+        with pytest.raises(Rejection, match=f'the header stamp is {stamp_ns} ns') as caught:
+            check_stamp(stamp_ns)
+        assert caught.value.reason == 'bad_stamp'
     check_stamp(2**31 * 10**9 - 1)
     check_stamp(1)
+
+
+# -- positions and headings of which a single number is not finite --------------------------------
+
+WHOLE = {
+    Fix: {'position': (1.0, 2.0, 3.0)},
+    GeodeticFix: {'latitude': 54.0, 'longitude': 10.0},
+    RelativeFix: {'offset': (1.0, 2.0, 3.0)},
+    Navigation: {'position': (1.0, 2.0, 3.0), 'orientation': (0.0, 0.0, 0.0, 1.0)},
+    Start: {'position': (1.0, 2.0, 3.0), 'covariance': np.eye(3)},
+    VesselHeading: {'orientation': (0.0, 0.0, 0.0, 1.0)},
+    VesselPose: {'position': (1.0, 2.0, 3.0), 'orientation': (0.0, 0.0, 0.0, 1.0)},
+}
+"""What each class needs besides its stamp."""
+
+
+def one_spoilt(values):
+    """The same values, one number of them not finite; each in turn."""
+    for name, value in values.items():
+        for index in np.ndindex(np.shape(value)):
+            for bad in (np.nan, np.inf):
+                spoilt = np.array(value, float)
+                spoilt[index] = bad
+                yield {**values, name: spoilt if spoilt.shape else float(spoilt)}
+
+
+@pytest.mark.parametrize('kind', WHOLE)
+def test_a_single_number_that_is_not_finite_is_refused(kind):
+    assert kind(stamp_ns=1, **WHOLE[kind]).stamp_ns == 1
+    with pytest.raises(Rejection, match='the header stamp is 0 ns'):
+        kind(stamp_ns=0, **WHOLE[kind])
+    # A z that is not measured may be NaN.
+    asked = [each for each in one_spoilt(WHOLE[kind]) if not _is_depth(kind, each)]
+    assert len(asked) >= 4
+    for values in asked:
+        with pytest.raises(Rejection):
+            kind(stamp_ns=1, **values)
+
+
+@pytest.mark.parametrize('variances', [(np.inf, 1.0), (1.0, np.inf), (np.inf, np.inf)])
+def test_one_axis_that_is_not_measured_is_enough(variances):
+    with pytest.raises(Rejection, match='states that x or y is not measured') as caught:
+        check_flat(np.diag(variances), 'a fix')
+    assert caught.value.reason == 'not_measured'
+
+
+@pytest.mark.parametrize('z', [np.nan, 1.0])
+@pytest.mark.parametrize(
+    'block, good',
+    [
+        ([[1.0, 0.5], [0.5, 1.0]], True),
+        ([[1e-4, 3e-5], [2e-5, 1e-4]], False),
+        ([[1.0, 2.0], [2.0, 1.0]], False),
+        ([[-1.0, 0.0], [0.0, 1.0]], False),
+        ([[np.nan, 0.0], [0.0, 1.0]], False),
+    ],
+)
+def test_a_fix_and_a_scan_take_the_same_covariances_of_x_and_y(block, good, z):
+    whole = np.pad(np.array(block), ((0, 1), (0, 1)))
+    whole[2, 2] = z
+    with contextlib.nullcontext() if good else pytest.raises(Rejection):
+        Fix(stamp_ns=1, position=np.zeros(3), covariance=whole)
+    with contextlib.nullcontext() if good else pytest.raises(Rejection):
+        Fixes(stamp_ns=1, position=np.zeros((1, 3)), covariance=whole[None])
+
+
+def test_a_variance_of_z_is_stated_up_to_one_that_says_that_it_is_not():
+    for variance, stated in ((0.999 * UNKNOWN_VARIANCE, True), (UNKNOWN_VARIANCE, False)):
+        made = Fix(stamp_ns=1, position=np.zeros(3), covariance=np.diag([1.0, 1.0, variance]))
+        assert np.isfinite(made.covariance[2, 2]) == stated
+
+
+def test_an_axis_of_which_nothing_is_said_gets_what_is_assumed():
+    assumed = np.diag([1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(filled(None, assumed), assumed)
+    np.testing.assert_array_equal(filled(np.zeros((3, 3)), assumed), assumed)
+    stated = by_axis(np.diag([4.0, -1.0, 9.0]))
+    np.testing.assert_array_equal(filled(stated, assumed), np.diag([4.0, 2.0, 9.0]))
+
+
+def _is_depth(kind, values):
+    covariance = values.get('covariance', np.eye(2))[:2, :2]
+    return kind in (Fix, Start) and np.isfinite([*values['position'][:2], *covariance.flat]).all()
+
+
+# -- snapshots of an array ------------------------------------------------------------------------
+
+
+def snapshot(bins=20, staves=4, **changes):
+    rng = np.random.default_rng(0)
+    values = {
+        'stamp_ns': 10**18,
+        'range': 17.0 + 0.05 * np.arange(bins),
+        'iq': rng.normal(size=(bins, staves)) + 1j * rng.normal(size=(bins, staves)),
+        'frame_id': 'sonar',
+    }
+    return Snapshot(**{**values, **changes})
+
+
+def test_what_is_fine_is_kept_as_it_came_and_read_only():
+    ping = snapshot()
+    assert len(ping) == 20 and ping.staves == 4 and ping.usable.all()
+    assert ping.iq.dtype == np.complex128 and ping.bin_width == pytest.approx(0.05)
+    single = ping.iq.astype(np.complex64)
+    assert snapshot(iq=single).iq.dtype == np.complex64
+    for array in (ping.range, ping.iq, ping.usable):
+        assert not array.flags.writeable
+    single[0] = 0.0  # the caller's array stays the caller's
+    assert single.flags.writeable
+
+
+@pytest.mark.parametrize(
+    'reason, changes',
+    [
+        ('bad_stamp', {'stamp_ns': 0}),
+        ('no_staves', {'staves': 0}),
+        ('bad_staves', {'staves': 1}),
+        ('bad_staves', {'staves': 65}),
+        ('too_short', {'bins': 1}),
+        ('too_short', {'bins': 0}),
+        ('bad_shape', {'range': np.arange(1.0, 20.0)}),
+        ('bad_shape', {'iq': np.ones(20)}),
+        ('bad_shape', {'noise_variance': np.ones(19)}),
+        ('bad_shape', {'two_way_time': np.ones(3)}),
+        ('bad_range', {'range': np.full(20, 5.0)}),
+        ('bad_range', {'range': -np.arange(20.0)}),
+        ('out_of_range', {'range': np.arange(20.0) - 3.0}),
+        ('out_of_range', {'range': 1e5 + np.arange(20.0)}),
+        ('nan', {'range': np.append(np.arange(19.0), np.nan)}),
+        ('nan', {'iq': np.full((20, 4), np.nan)}),
+        ('silent', {'iq': np.zeros((20, 4))}),
+        ('out_of_range', {'iq': np.full((20, 4), 1e-150)}),
+        ('out_of_range', {'iq': np.full((20, 4), 5e-324)}),
+        ('out_of_range', {'iq': np.full((20, 4), 1e200)}),
+        ('out_of_range', {'sound_speed': 15.0}),
+        ('out_of_range', {'frequency': 455.0}),
+        ('out_of_range', {'element_spacing': -0.1}),
+        ('out_of_range', {'sample_rate': np.nan}),
+        ('out_of_range', {'element_spacing': 1.0, 'frequency': 1e6, 'sound_speed': 1500.0}),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_its_reason(reason, changes):
+    with pytest.raises(Rejection) as caught:
+        snapshot(**changes)
+    assert caught.value.reason == reason and caught.value.sentence
+
+
+def test_bins_that_are_spoilt_or_of_another_size_are_kept_and_marked():
+    iq = np.ones((20, 4), complex)
+    iq[2], iq[4], iq[3, 1], iq[7], iq[9, 0] = 1e-200, 1e200, np.nan, 0.0, np.inf
+    assert np.flatnonzero(~snapshot(iq=iq).usable).tolist() == [2, 3, 4, 7, 9]
+
+
+def test_a_storm_of_bins_is_refused():
+    with pytest.raises(Rejection) as caught:
+        snapshot(bins=MAX_BINS + 1, staves=2)
+    assert caught.value.reason == 'too_large'
+    assert len(snapshot(bins=MAX_BINS, staves=2)) == MAX_BINS
+
+
+def test_variances_that_are_none_become_unknown():
+    for value in (5e-324, 1e-200, 1e200, np.inf, 0.0, -1.0):
+        assert snapshot(noise_variance=np.full(20, value)).noise_variance is None
+    variances = np.full(20, 2.0)
+    variances[:3] = [0.0, -1.0, np.inf]
+    ping = snapshot(noise_variance=variances, signal_variance=np.zeros(20))
+    assert np.isnan(ping.noise_variance[:3]).all() and (ping.noise_variance[3:] == 2.0).all()
+    assert ping.signal_variance is None
+
+
+def test_spacing_in_wavelengths_when_all_is_known():
+    ping = snapshot(element_spacing=0.00165, frequency=455e3, sound_speed=1500.0)
+    assert ping.spacing_wavelengths == pytest.approx(0.5005)
+    assert snapshot(element_spacing=0.00165, frequency=455e3).spacing_wavelengths is None
+
+
+def test_ranges_of_times_follow_the_sound_speed_unless_the_sonar_knows_it():
+    time = (17.0 + 0.05 * np.arange(20)) / 750.0
+    assert np.allclose(snapshot(two_way_time=time).ranges(1480.0), 740.0 * time)
+    known = snapshot(two_way_time=time, sound_speed=1500.0)
+    assert (known.ranges(1480.0) == known.range).all()
+    assert (snapshot().ranges(1480.0) == snapshot().range).all()
+
+
+# -- records of a fathometer ----------------------------------------------------------------------
+
+M = 5
+
+
+def reason_of(make, **fields):
+    with pytest.raises(Rejection) as caught:
+        make(**{'stamp_ns': 1, **fields})
+    assert caught.value.sentence[-1] != '.' and '\n' not in caught.value.sentence
+    return caught.value.reason
+
+
+def trace(**changes):
+    return {'depth': np.arange(10.0), 'amplitude': np.ones(10), **changes}
+
+
+def spectra(**changes):
+    rng = np.random.default_rng(0)
+    p = rng.standard_normal((7, M, 20)) + 1j * rng.standard_normal((7, M, 20))
+    R = p @ p.conj().swapaxes(1, 2) / 20
+    return {'frequency': 100.0 + np.arange(7.0), 'csdm': R, **changes}
+
+
+@pytest.mark.parametrize(
+    'changes, reason',
+    [
+        ({'depth': [1.0], 'amplitude': [1.0]}, 'too_short'),
+        ({'depth': [], 'amplitude': []}, 'too_short'),
+        ({'amplitude': np.ones(9)}, 'bad_shape'),
+        ({'sigma': np.ones(9)}, 'bad_shape'),
+        ({'depth': np.ones((10, 2))}, 'bad_shape'),
+        ({'depth': np.zeros(10)}, 'bad_depth'),
+        ({'depth': np.arange(10.0)[::-1]}, 'bad_depth'),
+        ({'depth': np.full(10, np.nan)}, 'nan'),
+        ({'amplitude': np.full(10, np.nan)}, 'nan'),
+        ({'amplitude': np.zeros(10)}, 'silent'),
+        ({'depth': 1e6 * np.arange(10.0)}, 'out_of_range'),
+        ({'reference_depth': 1e9}, 'out_of_range'),
+        ({'stamp_ns': 0}, 'bad_stamp'),
+    ],
+)
+def test_traces_that_cannot_be_used(changes, reason):
+    assert reason_of(Trace, **trace(**changes)) == reason
+
+
+def test_a_trace_keeps_what_it_can():
+    sigma = np.ones(10)
+    sigma[:3] = np.nan, -1.0, 0.0
+    item = Trace(stamp_ns=1, **trace(sigma=sigma, reference_depth=np.nan))
+    assert np.isnan(item.sigma[:3]).all() and (item.sigma[3:] == 1.0).all()
+    assert item.reference_depth is None
+    assert item.step == 1.0
+    assert Trace(stamp_ns=1, **trace(sigma=np.zeros(10))).sigma is None
+
+
+def lopsided(R):
+    R = R.copy()
+    R[2, 0, 1] += 1j
+    return R
+
+
+def overcoherent(R):
+    R = R.copy()
+    R[:, [0, 1], [1, 0]] *= 30.0
+    return R
+
+
+def overflowing(R):
+    """Cross terms and powers at the two ends of single precision."""
+    R = (R * 1e-40).astype(np.complex64)
+    R[:, 0, 1] = R[:, 1, 0] = 1e38
+    return R
+
+
+@pytest.mark.filterwarnings('error')
+def test_cross_spectra_of_any_loudness_are_taken():
+    for loudness in (1e-38, 1e-20, 1.0, 3e37):
+        fields = spectra()
+        fields['csdm'] = (fields['csdm'] * loudness).astype(np.complex64)
+        assert CrossSpectra(stamp_ns=1, **fields).alive.all()
+
+
+def boundless(R, rows, columns):
+    """Doubles of which two have no finite sum, at both places of a pair."""
+    R = R.astype(np.complex128)
+    R[:, rows, columns] = 1e308 * (1 + 1j * np.not_equal(rows, columns))
+    R[:, columns, rows] = R[:, rows, columns].conj()
+    return R
+
+
+@pytest.mark.filterwarnings('error')
+def test_a_hydrophone_whose_powers_have_no_sum_is_dead():
+    fields = spectra()
+    fields['csdm'] = boundless(fields['csdm'], 3, 3)
+    record = CrossSpectra(stamp_ns=1, **fields)
+    assert np.flatnonzero(~record.alive).tolist() == [3] and record.usable.all()
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize(
+    'change, reason',
+    [
+        (lambda R: boundless(R, *np.diag_indices(M)), 'nan'),
+        (lambda R: boundless(R, 0, 1), 'not_hermitian'),
+        (lopsided, 'not_hermitian'),
+        (overflowing, 'not_positive'),
+        (overcoherent, 'not_positive'),
+        (lambda R: np.full_like(R, np.nan), 'nan'),
+        (lambda R: np.zeros_like(R), 'silent'),
+        (lambda R: R[:3], 'bad_shape'),
+        (lambda R: R[:, :2], 'bad_shape'),
+        (lambda R: R[:, :2, :2], 'bad_hydrophones'),
+        (lambda R: R[0], 'bad_shape'),
+        (lambda R: R * (np.arange(M) < 2)[:, None] * (np.arange(M) < 2), 'dead_hydrophones'),
+    ],
+)
+def test_cross_spectra_that_cannot_be_used(change, reason):
+    fields = spectra()
+    fields['csdm'] = change(fields['csdm'])
+    assert reason_of(CrossSpectra, **fields) == reason
+
+
+def test_frequencies_that_cannot_be():
+    for frequency, reason in (
+        (np.ones(7), 'bad_frequency'),
+        (np.full(7, np.inf), 'nan'),
+        (np.arange(-3.0, 4.0), 'out_of_range'),
+    ):
+        assert reason_of(CrossSpectra, **spectra(frequency=frequency)) == reason
+    one = {name: value[:1] for name, value in spectra().items()}
+    assert reason_of(CrossSpectra, **one) == 'too_short'
+
+
+def test_dead_hydrophones_and_bad_rows_are_masked():
+    for value in (0.0, np.nan):
+        fields = spectra()
+        fields['csdm'][:, 2] = fields['csdm'][:, :, 2] = value
+        item = CrossSpectra(stamp_ns=1, **fields)
+        assert np.flatnonzero(~item.alive).tolist() == [2] and item.usable.all()
+    fields = spectra()
+    fields['csdm'][3, 0, 1] = np.nan
+    item = CrossSpectra(stamp_ns=1, **fields)
+    assert item.alive.all() and np.flatnonzero(~item.usable).tolist() == [3]
+
+
+def samples():
+    return np.random.default_rng(0).standard_normal((50, M)).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    'pressure, rate, reason',
+    [
+        (samples()[:1], 100.0, 'too_short'),
+        (samples()[:, :2], 100.0, 'bad_hydrophones'),
+        (samples()[:, 0], 100.0, 'bad_shape'),
+        (samples(), np.nan, 'out_of_range'),
+        (samples(), 0.0, 'out_of_range'),
+        (samples() * np.nan, 100.0, 'nan'),
+        (samples() * 0.0, 100.0, 'silent'),
+        (samples() * (np.arange(M) < 2), 100.0, 'dead_hydrophones'),
+        (samples().astype(float) * 1e300, 100.0, 'nan'),
+    ],
+)
+def test_pressure_that_cannot_be_used(pressure, rate, reason):
+    assert reason_of(Pressure, pressure=pressure, sample_rate=rate) == reason
+
+
+def test_a_hydrophone_with_a_lost_sample_is_masked():
+    p = samples()
+    p[7, 1] = np.nan
+    p[:, 3] = 2.5
+    item = Pressure(stamp_ns=1, pressure=p, sample_rate=100.0)
+    assert reason_of(Pressure, pressure=p, sample_rate=100.0, stamp_ns=0) == 'bad_stamp'
+    assert item.alive.tolist() == [True, False, True, False, True]
+    assert np.isfinite(item.pressure).all()
+    assert item.duration_ns == 500_000_000
+
+
+def test_depths_of_the_array():
+    assert ArrayDepth(stamp_ns=1, depth=73.5).depth == 73.5
+    assert reason_of(ArrayDepth, depth=np.nan) == 'nan'
+    assert reason_of(ArrayDepth, depth=1e6) == 'out_of_range'

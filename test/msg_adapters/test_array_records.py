@@ -10,7 +10,7 @@
 
 from attrs import evolve
 from helpers.refusals import reason
-from hypothesis import given, settings
+from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -26,27 +26,22 @@ from msg_adapters.array_records import (
     write_response,
     write_trace,
 )
+from msg_adapters.snapshots import CONSTANTS, read_snapshot, VARIANCES, write_snapshot
 from msg_adapters.table import decode_table, encode_table
-from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
+from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Snapshot, Trace
 from sonar_imm_tools.recordings.messages import ros_message
 
 STAMP = 10**18
 F, N = 5, 4
-EMPTY = np.empty((0, N), np.int16)
 
 
-def spectra(**changes):
+def spectra():
     rng = np.random.default_rng(0)
     p = rng.normal(size=(F, N, 7)) + 1j * rng.normal(size=(F, N, 7))
-    values = {
-        'stamp_ns': STAMP,
-        'frame_id': 'array',
-        'frequency': 100.0 + 2.0 * np.arange(F),
-        'csdm': (p @ p.conj().swapaxes(1, 2) / 7).astype(np.complex64),
-        'snapshots': 7,
-        'reference_depth': 73.5,
-    }
-    return CrossSpectra(**{**values, **changes})
+    return CrossSpectra(
+        stamp_ns=STAMP, frame_id='array', frequency=100.0 + 2.0 * np.arange(F), snapshots=7,
+        csdm=(p @ p.conj().swapaxes(1, 2) / 7).astype(np.complex64), reference_depth=73.5,
+    )  # fmt: skip
 
 
 def table(**columns):
@@ -88,67 +83,72 @@ def test_cross_spectra_come_back_as_they_went():
     assert row[2 * (1 * N + 3) + 1] == item.csdm[2, 1, 3].imag
 
 
-def test_what_is_not_said_is_not_known():
+def test_what_is_not_said_is_not_known_but_by_the_depth_of_the_deepest_element():
     back = read_csdm(csdm_table(spectra().csdm))
     assert back.snapshots == 0 and back.reference_depth is None
-
-
-def test_the_depth_of_the_elements_tells_that_of_the_deepest():
     depths = np.tile(np.float32([80.0, 79.8, 79.6, 79.4]), (F, 1))
     assert read_csdm(csdm_table(spectra().csdm, element_depth=depths)).reference_depth == 80.0
-    assert (
-        reason(read_csdm, csdm_table(spectra().csdm, element_depth=depths[:, :3])) == 'bad_field'
-    )
 
 
-@pytest.mark.parametrize(
-    'spoil, expected',
-    [
-        (lambda R: R + np.triu(np.ones((N, N)), 1), 'not_hermitian'),
-        (lambda R: R * np.nan, 'nan'),
-        (lambda R: R * 0.0, 'silent'),
-        (lambda R: R + 5.0 * (np.ones((N, N)) - np.eye(N)), 'not_positive'),
-        (lambda R: R[:, :2, :2], 'bad_hydrophones'),
-        (lambda R: R[:1], 'too_short'),
-        (lambda R: R[:0], 'too_short'),
-    ],
-)
-def test_hostile_matrices_are_named(spoil, expected):
-    assert reason(read_csdm, csdm_table(spoil(spectra().csdm))) == expected
-
-
-def test_a_dead_hydrophone_and_a_hydrophone_of_nan_are_masked():
+def test_dead_hydrophones_are_masked_and_singular_matrices_are_read_for_loading_mends_them():
     R = spectra().csdm.copy()
     R[:, 2], R[:, :, 2] = 0.0, 0.0
     assert list(read_csdm(csdm_table(R)).alive) == [True, True, False, True]
     R[:, 2], R[:, :, 2] = np.nan, np.nan
     assert list(read_csdm(csdm_table(R)).alive) == [True, True, False, True]
-
-
-def test_singular_matrices_are_read_for_loading_mends_them():
     p = np.exp(1j * np.arange(N))
     assert len(read_csdm(csdm_table(np.tile(np.outer(p, p.conj()), (F, 1, 1))))) == F
 
 
-def test_a_count_that_is_no_matrix_is_named():
-    flat = np.zeros((F, 30), np.float32)
-    message = table(frequency=np.float32(np.arange(F)), csdm=flat)
-    assert reason(read_csdm, message) == 'bad_field'
-    whole = table(frequency=np.float32(np.arange(F)), csdm=np.zeros((F, 32), np.int32))
-    assert reason(read_csdm, whole) == 'bad_field'
+ONES, FLAT = np.ones((50, N)), {'frequency': np.float32(np.arange(F))}
+HOSTILE = {
+    (read_csdm, csdm_table): {
+        'not_hermitian': [{'matrices': spectra().csdm + np.triu(np.ones((N, N)), 1)}],
+        'nan': [{'matrices': spectra().csdm * np.nan}],
+        'silent': [{'matrices': spectra().csdm * 0.0}],
+        'not_positive': [{'matrices': spectra().csdm + 5.0 * (np.ones((N, N)) - np.eye(N))}],
+        'bad_hydrophones': [{'matrices': spectra().csdm[:, :2, :2]}],
+        'too_short': [{'matrices': spectra().csdm[:1]}, {'matrices': spectra().csdm[:0]}],
+        'bad_field': [{'matrices': spectra().csdm, 'element_depth': np.float32(ONES[:F, :3])}],
+    },
+    (read_csdm, table): {
+        'bad_field': [{**FLAT, 'csdm': np.zeros((F, 30), np.float32)},
+                      {**FLAT, 'csdm': np.zeros((F, 32), np.int32)}],
+        'missing_column csdm': [FLAT],
+    },
+    (read_pressure, pressure_table): {
+        'missing_column scale': [{'p': np.zeros((50, N), np.int16)}],
+        'missing_column sample_rate': [{'sample_rate': None}],
+        'bad_scale': [{'p': np.int16(ONES), 'scale': np.zeros(50, np.float32)},
+                      {'rows': 0, 'p': np.int16(ONES[:0]), 'scale': np.float32(ONES[:0, 0])}],
+        'silent': [{'p': np.float32(0.0 * ONES)}],
+        'nan': [{'p': np.float32(np.nan * ONES)}],
+        'bad_hydrophones': [{'p': np.float32(ONES[:, :2])}],
+        'out_of_range': [{'sample_rate': np.zeros(50, np.float32)}],
+        'not_constant': [{'sample_rate': np.linspace(1e4, 2e4, 50, dtype=np.float32)}],
+        'too_short': [{'rows': 1}, {'rows': 0}],
+    },
+    (read_trace, trace_table): {
+        'missing_column amplitude': [{'amplitude': None}],
+        'nan': [{'amplitude': np.full(60, np.nan, np.float32)},
+                {'depth': np.full(60, np.inf, np.float32)}],
+        'silent': [{'amplitude': np.zeros(60, np.float32)}],
+        'bad_field': [{'amplitude': np.zeros((60, 2), np.float32)}],
+        'bad_depth': [{'depth': np.float32(np.arange(60)[::-1])}],
+        'out_of_range': [{'depth': np.float32(1e4 * np.arange(60))}],
+        'too_short': [{'rows': 1}, {'rows': 0}],
+    },
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    'read, message, name',
-    [
-        (read_csdm, table(frequency=np.float32([1, 2])), 'csdm'),
-        (read_pressure, table(p=np.zeros((5, 4), np.float32)), 'sample_rate'),
-        (read_trace, table(depth=np.float32([1, 2])), 'amplitude'),
-    ],
-)
-def test_missing_columns_are_named(read, message, name):
-    with pytest.raises(Rejection, match=name):
-        read(message)
+@pytest.mark.parametrize('read, make', HOSTILE)
+def test_hostile_tables_are_named(read, make):
+    for words, rows in HOSTILE[read, make].items():
+        code, _, column = words.partition(' ')
+        for changes in rows:
+            assert reason(read, make(**changes)) == code, words
+            with pytest.raises(Rejection, match=column or None):
+                read(make(**changes))
 
 
 def test_pressure_comes_back_as_floats_or_as_scaled_whole_numbers():
@@ -168,14 +168,9 @@ def test_pressure_comes_back_as_floats_or_as_scaled_whole_numbers():
 
 @pytest.mark.parametrize(
     'peak, kept, whole',
-    [
-        (127, 127, np.int8),
-        (128, 128, np.int16),
-        (32_767, 32_767, np.int16),
-        (32_768, 32_767, np.int16),
-        (-40_000, -32_768, np.int16),
-    ],
-)
+    [(127, 127, np.int8), (128, 128, np.int16), (32_767, 32_767, np.int16),
+     (32_768, 32_767, np.int16), (-40_000, -32_768, np.int16)],
+)  # fmt: skip
 def test_pressure_at_the_limit_of_its_whole_numbers_is_clipped_and_keeps_its_sign(
     peak, kept, whole
 ):
@@ -185,25 +180,6 @@ def test_pressure_at_the_limit_of_its_whole_numbers_is_clipped_and_keeps_its_sig
     message = write_pressure(block, ros_message)
     assert decode_table(message)['p'].dtype == whole
     assert read_pressure(message).pressure[7].tolist() == [-1.0, kept, -3.0, 4.0]
-
-
-@pytest.mark.parametrize(
-    'changes, expected',
-    [
-        ({'p': np.zeros((50, N), np.int16)}, 'missing_column'),
-        ({'p': np.ones((50, N), np.int16), 'scale': np.zeros(50, np.float32)}, 'bad_scale'),
-        ({'p': np.zeros((50, N), np.float32)}, 'silent'),
-        ({'p': np.full((50, N), np.nan, np.float32)}, 'nan'),
-        ({'p': np.ones((50, 2), np.float32)}, 'bad_hydrophones'),
-        ({'sample_rate': np.zeros(50, np.float32)}, 'out_of_range'),
-        ({'sample_rate': np.linspace(1e4, 2e4, 50, dtype=np.float32)}, 'not_constant'),
-        ({'rows': 1}, 'too_short'),
-        ({'rows': 0}, 'too_short'),
-        ({'rows': 0, 'p': EMPTY, 'scale': np.float32(EMPTY[:, 0])}, 'bad_scale'),
-    ],
-)
-def test_hostile_pressure_is_named(changes, expected):
-    assert reason(read_pressure, pressure_table(**changes)) == expected
 
 
 def test_a_dead_hydrophone_does_not_spoil_the_block():
@@ -227,23 +203,6 @@ def test_traces_come_back_with_their_noise():
     assert (back.depth == depth).all() and (back.sigma == 0.5).all()
     assert back.reference_depth == 0.0  # at the surface, not unknown
     assert read_trace(trace_table()).sigma is None
-
-
-@pytest.mark.parametrize(
-    'changes, expected',
-    [
-        ({'amplitude': np.full(60, np.nan, np.float32)}, 'nan'),
-        ({'amplitude': np.zeros(60, np.float32)}, 'silent'),
-        ({'amplitude': np.zeros((60, 2), np.float32)}, 'bad_field'),
-        ({'depth': np.float32(np.arange(60)[::-1])}, 'bad_depth'),
-        ({'depth': np.full(60, np.inf, np.float32)}, 'nan'),
-        ({'depth': np.float32(1e4 * np.arange(60))}, 'out_of_range'),
-        ({'rows': 1}, 'too_short'),
-        ({'rows': 0}, 'too_short'),
-    ],
-)
-def test_hostile_traces_are_named(changes, expected):
-    assert reason(read_trace, trace_table(**changes)) == expected
 
 
 def test_a_response_is_a_trace_that_can_be_drawn():
@@ -288,3 +247,148 @@ def test_bytes_of_any_kind_are_read_or_refused(data, read):
         read(good)
     except Rejection as rejection:
         assert rejection.sentence
+
+
+# -- snapshots of pings
+
+
+BINS, STAVES = 6, 3
+
+
+def columns(bins=BINS, staves=STAVES, **changes):
+    rng = np.random.default_rng(0)
+    base = {
+        'range': np.float32(17.0 + 0.05 * np.arange(bins)),
+        'iq': rng.normal(size=(bins, 2 * staves)).astype(np.float32),
+        'sound_speed': np.full(bins, 1500.0, np.float32),
+    }
+    base.update(changes)
+    return {name: column for name, column in base.items() if column is not None}
+
+
+def message(stamp_ns=10**18, **changes):
+    return encode_table(columns(**changes), stamp_ns=stamp_ns, frame_id='sonar', make=ros_message)
+
+
+def organised(**changes):
+    """The same samples as a cloud of one row a range bin and one column a stave."""
+    table = columns()
+    cloud = {
+        're': table['iq'][:, 0::2].ravel(),
+        'im': table['iq'][:, 1::2].ravel(),
+        'range': np.repeat(table['range'], STAVES),
+        **changes,
+    }
+    cloud = encode_table(cloud, stamp_ns=10**18, frame_id='sonar', make=ros_message)
+    cloud.height, cloud.width = BINS, STAVES
+    cloud.row_step = STAVES * cloud.point_step
+    return cloud
+
+
+def test_samples_are_interleaved_real_and_imaginary():
+    snapshot = read_snapshot(message())
+    iq = columns()['iq']
+    assert snapshot.iq.dtype == np.complex64 and snapshot.staves == STAVES
+    assert (snapshot.iq == iq[:, 0::2] + 1j * iq[:, 1::2]).all()
+    assert (snapshot.range == columns()['range']).all() and snapshot.frame_id == 'sonar'
+    assert snapshot.sound_speed == 1500.0
+    assert snapshot.frequency is None and snapshot.noise_variance is None
+
+
+def test_an_organised_cloud_says_the_same_and_times_become_ranges():
+    first, other = read_snapshot(message()), read_snapshot(organised())
+    assert (first.iq == other.iq).all() and (first.range == other.range).all()
+    assert reason(read_snapshot, organised(range=np.zeros(BINS * STAVES))) == 'bad_range'
+    time = (17.0 + 0.05 * np.arange(BINS)) / 750.0
+    snapshot = read_snapshot(message(range=None, time=time))
+    assert np.allclose(snapshot.range, 750.0 * time) and (snapshot.two_way_time == time).all()
+    unknown = read_snapshot(message(range=None, time=time, sound_speed=None))
+    assert np.allclose(unknown.ranges(1480.0), 740.0 * time)
+    cloud = organised()
+    cloud.width = 0
+    assert reason(read_snapshot, cloud) == 'no_staves'
+    many = {'range': np.arange(1e6, dtype=np.float32), 'iq': np.ones((10**6, 4), np.float32)}
+    cloud = encode_table(many, stamp_ns=10**18, frame_id='sonar', make=ros_message)
+    assert reason(read_snapshot, cloud) == 'too_large'
+
+
+def test_constants_hold_for_the_whole_ping():
+    changing = np.float32([1500.0] * (BINS - 1) + [1501.0])
+    assert reason(read_snapshot, message(sound_speed=changing)) == 'not_constant'
+    partly = np.float32([np.nan] * (BINS - 1) + [1501.0])
+    assert read_snapshot(message(sound_speed=partly)).sound_speed == 1501.0
+    for nothing in (0.0, np.nan):
+        snapshot = read_snapshot(message(sound_speed=np.full(BINS, nothing)))
+        assert snapshot.sound_speed is None
+
+
+@pytest.mark.parametrize(
+    'code, rows',
+    [
+        ('missing_column', [{'iq': None}, {'range': None}]),
+        ('bad_field', [{'iq': np.ones((BINS, 5), np.float32)}, {'iq': np.ones(BINS)}]),
+        ('bad_field', [{'range': np.ones((BINS, 2))}]),
+        ('bad_staves', [{'staves': 1}, {'staves': 65}]),
+        ('too_short', [{'bins': 1}, {'bins': 0}]),
+        ('bad_stamp', [{'stamp_ns': 0}]),
+        ('nan', [{'iq': np.full((BINS, 6), np.nan, np.float32)}]),
+        ('silent', [{'iq': np.zeros((BINS, 6), np.float32)}]),
+        ('out_of_range', [{'element_spacing': np.full(BINS, -1.0)}]),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_its_reason(code, rows):
+    assert [reason(read_snapshot, message(**changes)) for changes in rows] == [code] * len(rows)
+
+
+@pytest.mark.parametrize('times', [False, True])
+def test_writing_and_reading_gives_the_same_snapshot(times):
+    rng = np.random.default_rng(1)
+    noise = np.float32([1.0, 2.0, np.nan, 4.0])
+    time = np.arange(1.0, 5.0) * 1e-3 / 3.0
+    snapshot = Snapshot(
+        stamp_ns=10**18 + 1, frame_id='sonar', range=np.float32([17.0, 17.1, 17.2, 17.3]),
+        iq=(rng.normal(size=(4, 8)) + 1j * rng.normal(size=(4, 8))).astype(np.complex64),
+        two_way_time=time if times else None, noise_variance=noise, sound_speed=1500.0,
+        signal_variance=noise, frequency=455e3, element_spacing=2.0**-9, sample_rate=15e3,
+    )  # fmt: skip
+    again = read_snapshot(write_snapshot(snapshot, ros_message))
+    assert again.stamp_ns == snapshot.stamp_ns and (again.iq == snapshot.iq).all()
+    assert np.allclose(again.range, 750.0 * time if times else snapshot.range, rtol=1e-15)
+    for name in (*VARIANCES, *CONSTANTS):
+        assert np.array_equal(getattr(again, name), getattr(snapshot, name), equal_nan=True), name
+
+
+NASTY = np.array([0.1, 1.0, 17.0, 0.0, -1.0, 1e-30, 1e30, 1e38, 1500.0, np.nan, np.inf, -np.inf])
+COLUMNS_OF_PINGS = ('range', 'time', 'iq', *CONSTANTS, *VARIANCES)
+
+
+@given(
+    bins=st.integers(0, 4),
+    staves=st.integers(0, 3),
+    nasty=st.sets(st.sampled_from(COLUMNS_OF_PINGS)),
+    gone=st.sampled_from(('range', 'iq', 'time', 'frequency')),
+    cut=st.sampled_from((0, 0, 3)),
+    values=st.binary(min_size=24, max_size=24),
+)
+@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
+def test_hostile_snapshots_are_refused_or_usable(bins, staves, nasty, gone, cut, values):
+    table = columns(bins=bins, staves=max(staves, 1))
+    drawn = NASTY[np.frombuffer(values, np.uint8) % len(NASTY)].astype(np.float32)
+    for name in sorted(nasty):
+        wide = 2 * max(staves, 1) if name == 'iq' else 1
+        table[name] = np.resize(drawn, (bins, wide)) if wide > 1 else np.resize(drawn, bins)
+        drawn = np.roll(drawn, 5)
+    table.pop(gone, None)
+    cloud = encode_table(table, stamp_ns=10**18, frame_id='sonar', make=ros_message)
+    cloud.data = cloud.data[: len(cloud.data) - cut]
+    try:
+        snapshot = read_snapshot(cloud)
+    except Rejection as rejection:
+        assert rejection.reason and rejection.sentence
+        return
+    assert snapshot.usable.any() and snapshot.bin_width > 0.0
+    assert np.isfinite(snapshot.iq[snapshot.usable]).all()
+    for name in VARIANCES:
+        known = getattr(snapshot, name)
+        assert known is None or (known[~np.isnan(known)] > 0.0).all()
+    assert snapshot.sound_speed is None or 1300.0 <= snapshot.sound_speed <= 1700.0

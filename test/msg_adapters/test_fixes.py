@@ -8,6 +8,7 @@
 
 import math
 
+from helpers import marine
 from helpers.marine import driver_message
 from helpers.refusals import reason
 from hypothesis import given, HealthCheck, settings
@@ -19,18 +20,35 @@ from msg_adapters.fixes import (
     doubt_fix,
     doubt_geodetic,
     doubt_height,
+    read_beacon,
     read_fix,
     read_geodetic,
+    read_modem,
+    read_relative,
     read_start,
+    read_usbl_data,
     read_vessel_fix,
     write_fix,
     write_geo,
     write_geodetic,
+    write_relative,
     write_start,
 )
+from msg_adapters.navigation import read_heading, read_vessel_pose, write_heading
 from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.acoustics.geometry import flip_quaternion, rotation_of_quaternion
 from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import Fix, GeodeticFix, Rejection, Start, VesselFix
+from sonar_imm.measurements import (
+    Fix,
+    GeodeticFix,
+    NOBODY,
+    Rejection,
+    RelativeFix,
+    Start,
+    VesselFix,
+    VesselHeading,
+    VesselPose,
+)
 from sonar_imm_tools.recordings.messages import ros_message
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
@@ -48,10 +66,10 @@ def header(sec=100, nanosec=5, frame_id='map'):
 
 def pose(covariance=None, x=1.0, y=2.0, z=3.0, **head):
     message = ros_message(POSE, header=header(**head))
-    message.pose.pose.position.x, message.pose.pose.position.y = x, y
-    message.pose.pose.position.z = z
+    place = message.pose.pose.position
+    place.x, place.y, place.z = x, y, z
     if covariance is not None:
-        message.pose.covariance[:] = np.ravel(covariance)
+        message.pose.covariance = np.ravel(np.asarray(covariance, float))
     return message
 
 
@@ -77,21 +95,16 @@ def test_a_pose_and_a_point_are_read():
 
 
 @pytest.mark.parametrize(
-    'covariance, doubt',
-    [
-        (block(0.0, 0.0, 0.0, 0.0), 'zero_covariance'),
-        (block(-1.0, 0.0, 0.0, 4.0), None),
-        (block(4.0, 0.0, 0.0, -1.0), None),
-        (-np.eye(6), None),
-        (block(math.nan, 0.0, 0.0, 1.0), None),
-        (block(1.0, math.inf, math.inf, 1.0), None),
-    ],
-)
-def test_what_is_no_covariance_is_unknown_and_the_position_used(covariance, doubt):
+    'covariance',
+    [(0.0, 0.0, 0.0, 0.0), (-1.0, 0.0, 0.0, 4.0), (4.0, 0.0, 0.0, -1.0),
+     (math.nan, 0.0, 0.0, 1.0), (1.0, math.inf, math.inf, 1.0)],
+)  # fmt: skip
+def test_what_is_no_covariance_is_unknown_and_the_position_used(covariance):
     """As in navigation and in NavSatFix; only zero is doubted."""
-    fix = read_fix(pose(covariance))
+    message = pose(block(*covariance))
+    fix = read_fix(message)
     assert fix.covariance is None and fix.position[0] == 1.0
-    assert doubt_fix(pose(covariance)) == doubt
+    assert doubt_fix(message) == (None if any(covariance) else 'zero_covariance')
 
 
 def test_what_is_not_used_may_be_nonsense():
@@ -123,12 +136,7 @@ def test_the_height_is_read_where_its_variance_is_stated():
 @pytest.mark.parametrize(
     'message',
     [
-        spatial(0.0),
-        spatial(-1.0),
-        spatial(math.nan),
-        spatial(math.inf),
-        spatial(1e-300),
-        spatial(1e6),
+        *map(spatial, (0.0, -1.0, math.nan, math.inf, 1e-300, 1e6)),
         spatial(0.25, math.nan),
         spatial(0.25, 1.0, 0.0),  # as good as singular with x: the correlation is 1
         spatial(0.25, 0.9, 0.9),
@@ -147,29 +155,19 @@ def test_a_height_that_is_not_stated_or_cannot_be_true_is_left_out_alone(message
 
 
 @pytest.mark.parametrize(
-    'message, code',
+    'code, messages',
     [
-        (pose(block(4.0, 1.0, 2.0, 9.0)), 'bad_covariance'),
-        (pose(block(1.0, 2.0, 2.0, 1.0)), 'bad_covariance'),
-        (pose(block(1e-300, 0.0, 0.0, 1e-300)), 'out_of_range'),
-        (pose(block(1e300, 0.0, 0.0, 1e308)), 'not_measured'),
-        (pose(x=math.nan), 'nan'),
-        (pose(y=math.inf), 'nan'),
-        (pose(x=1e9), 'out_of_range'),
-        (pose(sec=0, nanosec=0), 'bad_stamp'),
-        (pose(sec=-5), 'bad_stamp'),
-        (pose(nanosec=2**32 - 1), 'bad_stamp'),
-        (pose(frame_id='odom_ned'), 'frame_ned'),
+        ('bad_covariance', [pose(block(4.0, 1.0, 2.0, 9.0)), pose(block(1.0, 2.0, 2.0, 1.0))]),
+        ('out_of_range', [pose(block(1e-300, 0.0, 0.0, 1e-300)), pose(x=1e9)]),
+        ('not_measured', [pose(block(1e300, 0.0, 0.0, 1e308))]),
+        ('bad_shape', [pose(np.zeros(35))]),
+        ('nan', [pose(x=math.nan), pose(y=math.inf)]),
+        ('bad_stamp', [pose(sec=0, nanosec=0), pose(sec=-5), pose(nanosec=2**32 - 1)]),
+        ('frame_ned', [pose(frame_id='odom_ned')]),
     ],
 )
-def test_what_cannot_be_used_is_refused_with_its_reason(message, code):
-    assert reason(read_fix, message) == code
-
-
-def test_a_covariance_of_another_size_is_refused():
-    message = pose()
-    message.pose.covariance = np.zeros(35)
-    assert reason(read_fix, message) == 'bad_shape'
+def test_what_cannot_be_used_is_refused_with_its_reason(code, messages):
+    assert [reason(read_fix, message) for message in messages] == [code] * len(messages)
 
 
 @pytest.mark.parametrize('covariance', [None, [[4.0, 0.1], [0.1, 9.0]], WHOLE, ONLY_Z])
@@ -182,17 +180,12 @@ def test_writing_and_reading_gives_the_same_fix(covariance):
     again = read_fix(message)
     assert again.stamp_ns == fix.stamp_ns and again.frame_id == 'map'
     assert (again.position == fix.position).all() and doubt_fix(message) is None
-    assert (
-        (again.covariance is None)
-        if covariance is None
-        else again.covariance.tobytes() == fix.covariance.tobytes()
-    )
+    assert (again.covariance is None) == (covariance is None)
+    assert covariance is None or again.covariance.tobytes() == fix.covariance.tobytes()
 
 
-NASTY = (
-    1.0, 2.0, 4.0, 0.5, 0.0, -0.0, -1.0, 1e-300, 1e-12, 1e9, 1e300, 1e-160, math.nan, math.inf,
-    -math.inf, 1 / 3, 100.0,
-)  # fmt: skip
+NASTY = (1.0, 2.0, 4.0, 0.5, 0.0, -0.0, -1.0, 1e-300, 1e-12, 1e9, 1e300, 1e-160, math.nan,
+         math.inf, -math.inf, 1 / 3, 100.0)  # fmt: skip
 
 
 @given(
@@ -220,11 +213,9 @@ def test_hostile_fixes_are_refused_or_finite(values, symmetric, sec, nanosec, fr
     if fix.covariance is not None:
         flat, z = fix.covariance[:2, :2], fix.covariance[2, 2]
         assert np.isnan(z) or 1e-12 <= z < 1e6
-        if np.isfinite(z) and np.isnan(flat).all():
-            return
-        assert np.isfinite(flat).all()
-        assert (np.linalg.eigvalsh(flat) >= 0.99e-12).all()
-        assert flat.max() <= 1e16
+        if np.isnan(z) or not np.isnan(flat).all():
+            assert np.isfinite(flat).all() and flat.max() <= 1e16
+            assert (np.linalg.eigvalsh(flat) >= 0.99e-12).all()
 
 
 # -- Latitude and longitude from messages, and estimates as NavSatFix --
@@ -234,32 +225,18 @@ STAMP = 1_700_000_000_123_456_789
 
 
 def navsat(**changes):
-    values = {
-        'stamp_ns': STAMP,
-        'latitude': 59.0,
-        'longitude': 10.0,
-        'height': 12.0,
-        'covariance': np.array([[4.0, 0.5, 0.1], [0.5, 9.0, 0.2], [0.1, 0.2, 16.0]]),
-        'frame_id': 'gps',
-    }
-    message = write_geodetic(GeodeticFix(**values), ros_message)
-    for path, value in changes.items():
-        *way, last = path.split('__')
-        target = message
-        for step in way:
-            target = getattr(target, step)
-        object.__setattr__(target, last, value)
-    return message
+    fix = GeodeticFix(
+        stamp_ns=STAMP, latitude=59.0, longitude=10.0, height=12.0, frame_id='gps',
+        covariance=np.array([[4.0, 0.5, 0.1], [0.5, 9.0, 0.2], [0.1, 0.2, 16.0]]),
+    )  # fmt: skip
+    return marine.put(write_geodetic(fix, ros_message), **changes)
 
 
-def test_a_navsatfix_is_read_as_it_was_written():
+def test_a_navsatfix_is_read_as_it_was_written_and_left_out_without_a_fix():
     fix = read_geodetic(navsat())
     assert (fix.stamp_ns, fix.latitude, fix.longitude, fix.height) == (STAMP, 59.0, 10.0, 12.0)
     assert fix.covariance[0].tolist() == [4.0, 0.5, 0.1] and fix.frame_id == 'gps'
     assert isinstance(read_vessel_fix(navsat()), VesselFix)
-
-
-def test_no_fix_is_named_and_left_out():
     assert reason(read_geodetic, navsat(status__status=-1)) == 'no_fix'
     for status in (0, 1, 2):
         assert read_geodetic(navsat(status__status=status)).latitude == 59.0
@@ -267,40 +244,30 @@ def test_no_fix_is_named_and_left_out():
 
 @pytest.mark.parametrize(
     'kind, expected',
-    [
-        (0, None),
-        (1, [4.0, 0.5, 0.1]),
-        (2, [4.0, 0.0, 0.0]),
-        (3, [4.0, 0.5, 0.1]),
-    ],
+    [(0, None), (1, [4.0, 0.5, 0.1]), (2, [4.0, 0.0, 0.0]), (3, [4.0, 0.5, 0.1])],
 )
 def test_the_type_of_a_covariance_decides(kind, expected):
     covariance = read_geodetic(navsat(position_covariance_type=kind)).covariance
     assert expected == (None if covariance is None else covariance[0].tolist())
 
 
-@pytest.mark.parametrize('place', [(0.0, 0.0), (1e-7, -1e-7)])
 @pytest.mark.parametrize('read', [read_geodetic, read_vessel_fix])
-def test_latitude_0_longitude_0_is_no_fix(place, read):
-    message = navsat(latitude=place[0], longitude=place[1])
-    assert reason(read, message) == 'no_fix'
+def test_latitude_0_longitude_0_is_no_fix(read):
+    for latitude, longitude in ((0.0, 0.0), (1e-7, -1e-7)):
+        assert reason(read, navsat(latitude=latitude, longitude=longitude)) == 'no_fix'
 
 
-def test_a_covariance_of_nan_is_unknown_and_so_is_a_height():
+def test_a_covariance_that_says_nothing_is_unknown_and_so_is_a_height():
     assert np.isnan(read_geodetic(navsat(altitude=float('nan'))).height)
     assert read_geodetic(navsat(position_covariance=np.full(9, np.nan))).covariance is None
-    flat = np.diag([1.0, 2.0, np.nan]).ravel()
-    covariance = read_geodetic(navsat(position_covariance=flat)).covariance
-    assert np.diag(covariance)[:2].tolist() == [1.0, 2.0] and covariance[2, 2] > 1e5
-
-
-def test_a_covariance_that_was_not_filled_in_is_unknown_and_doubted():
+    for of_z in (np.nan, 0.0):
+        flat = np.diag([1.0, 2.0, of_z]).ravel()
+        covariance = read_geodetic(navsat(position_covariance=flat)).covariance
+        assert np.diag(covariance)[:2].tolist() == [1.0, 2.0] and covariance[2, 2] > 1e5
     zero = navsat(position_covariance=np.zeros(9))
     assert read_geodetic(zero).covariance is None
     assert doubt_geodetic(zero) == 'zero_covariance' and doubt_geodetic(navsat()) is None
     assert doubt_geodetic(navsat(position_covariance_type=0)) is None
-    flat = np.diag([1.0, 1.0, 0.0]).ravel()
-    assert read_geodetic(navsat(position_covariance=flat)).covariance[2, 2] > 1e5
 
 
 @pytest.mark.parametrize(
@@ -328,11 +295,8 @@ def test_what_is_no_position_is_refused(changes, expected):
     ],
 )
 def test_geographic_messages_are_read_by_their_fields(name, way):
-    message = driver_message(
-        f'geographic_msgs/msg/{name}',
-        header__stamp__sec=7,
-        **{f'{way}__latitude': -33.0, f'{way}__longitude': 151.0, f'{way}__altitude': -4.0},
-    )
+    place = {f'{way}__latitude': -33.0, f'{way}__longitude': 151.0, f'{way}__altitude': -4.0}
+    message = driver_message(f'geographic_msgs/msg/{name}', header__stamp__sec=7, **place)
     fix = read_geodetic(message)
     assert (fix.latitude, fix.longitude, fix.height) == (-33.0, 151.0, -4.0)
     assert fix.covariance is None
@@ -387,7 +351,7 @@ def start_message(x=1.0, y=2.0, z=3.0, covariance=None, **values):
     return message
 
 
-def test_a_start_is_read_and_written():
+def test_a_start_is_read_and_written_also_its_height_and_turned():
     start = read_start(start_message())
     assert start.stamp_ns == STAMP and start.frame_id == 'map'
     assert start.position.tolist() == [1.0, 2.0, 3.0]
@@ -395,37 +359,172 @@ def test_a_start_is_read_and_written():
     again = read_start(write_start(start, ros_message))
     assert (again.position == start.position).all()
     assert np.isnan(start.covariance[2]).all() and again.key() == start.key()
-
-
-def test_the_height_of_a_start_is_read_where_it_is_stated():
     covariance = np.array([[4.0, 1.0, 0.2], [1.0, 9.0, 0.3], [0.2, 0.3, 0.25]])
     start = Start(stamp_ns=STAMP, position=[1.0, 2.0, 3.0], covariance=covariance, frame_id='map')
     again = read_start(write_start(start, ros_message))
     assert again.covariance.tolist() == covariance.tolist() and again.key() == start.key()
-
-
-def test_north_east_down_is_turned():
     start = read_start(start_message(), world_frame='ned')
     assert start.position.tolist() == [2.0, 1.0, -3.0]
     assert start.covariance[:2, :2].tolist() == [[9.0, 1.0], [1.0, 4.0]]
 
 
 @pytest.mark.parametrize(
-    'given, code',
+    'code, name, values',
     [
-        ({'x': math.nan}, 'nan'),
-        ({'y': math.inf}, 'nan'),
-        ({'x': 2e8}, 'out_of_range'),
-        ({'covariance': np.zeros((2, 2))}, 'no_covariance'),
-        ({'covariance': [[-1.0, 0.0], [0.0, -1.0]]}, 'no_covariance'),
-        ({'covariance': [[math.nan, 0.0], [0.0, 1.0]]}, 'no_covariance'),
-        ({'covariance': [[1.0, 2.0], [2.0, 1.0]]}, 'bad_covariance'),
-        ({'covariance': [[1.0, 0.5], [0.0, 1.0]]}, 'bad_covariance'),
-        ({'covariance': np.eye(2) * 1e-20}, 'out_of_range'),
-        ({'covariance': np.eye(2) * 1e20}, 'not_measured'),
-        ({'frame_id': 'map_ned'}, 'frame_ned'),
-        ({'stamp': ros_message('builtin_interfaces/msg/Time')}, 'bad_stamp'),
+        ('nan', 'x', [math.nan]),
+        ('nan', 'y', [math.inf]),
+        ('out_of_range', 'x', [2e8]),
+        ('no_covariance', 'covariance',
+         [np.zeros((2, 2)), -np.eye(2), [[math.nan, 0.0], [0.0, 1.0]]]),
+        ('bad_covariance', 'covariance', [[[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]]),
+        ('out_of_range', 'covariance', [np.eye(2) * 1e-20]),
+        ('not_measured', 'covariance', [np.eye(2) * 1e20]),
+        ('frame_ned', 'frame_id', ['map_ned']),
+        ('bad_stamp', 'stamp', [ros_message('builtin_interfaces/msg/Time')]),
+    ],
+)  # fmt: skip
+def test_a_start_that_cannot_be_used_is_refused(code, name, values):
+    for value in values:
+        assert reason(read_start, start_message(**{name: value})) == code
+
+
+# -- positions from transceivers: what each driver means, and what it flags
+
+
+SEVENTH = 7_000_000_000
+
+
+def modem(**values):
+    given = {
+        'header__stamp__sec': 7, 'header__frame_id': 'x150', 'src_id': 3, 'includes_range': True,
+        'range_dist': 200, 'includes_usbl': True, 'usbl_azimuth': 900, 'usbl_elevation': -300,
+    }  # fmt: skip
+    return driver_message('seatrac_interfaces/msg/ModemRec', **{**given, **values})
+
+
+def test_a_modem_gives_range_and_direction_or_its_position():
+    fix = read_modem(modem())
+    assert (fix.stamp_ns, fix.target_id, fix.frame_id) == (SEVENTH, 3, 'x150')
+    # 20 m to starboard, 30 degrees down: port is y.
+    assert fix.offset == pytest.approx([0.0, -20.0 * np.cos(np.pi / 6), -10.0], abs=1e-9)
+    assert not fix.levelled and fix.covariance is None
+    fix = read_modem(
+        modem(
+            includes_usbl=False, includes_position=True, position_easting=100,
+            position_northing=-50, position_depth=80, depth_local=20,
+        )
+    )  # fmt: skip
+    assert fix.levelled and fix.offset == pytest.approx([10.0, -5.0, -6.0])
+    depth_only = {'includes_usbl': False, 'includes_position': True, 'position_depth': 80}
+    assert reason(read_modem, modem(position_flt_error=True)) == 'flagged_invalid'
+    for fields in ({'includes_usbl': False}, {'includes_range': False}, depth_only):
+        assert reason(read_modem, modem(**fields)) == 'no_position'
+
+
+def usbl(**values):
+    given = {'header__stamp__sec': 9, 'current_time': 102.0, 'measurement_time': 100.0}
+    return driver_message(
+        'acomms_msgs/msg/UsblData', **{**given, 'remote_address': 5, 'accuracy': 0.5, **values}
+    )
+
+
+def test_usbl_data_is_as_old_as_the_device_says_and_may_be_in_its_axes():
+    fix = read_usbl_data(usbl(enu__x=3.0, enu__y=4.0, enu__z=-5.0, xyz__x=1.0))
+    assert fix.stamp_ns == 7_000_000_000 and fix.target_id == 5 and fix.levelled
+    assert fix.offset.tolist() == [3.0, 4.0, -5.0]
+    assert fix.covariance == pytest.approx(0.25 * np.eye(3))
+    for clock in (99.0, 1e6, float('nan')):
+        assert read_usbl_data(usbl(xyz__x=1.0, current_time=clock)).stamp_ns == 9_000_000_000
+    fix = read_usbl_data(usbl(xyz__x=1.0, xyz__y=2.0, xyz__z=3.0, accuracy=0.0))
+    assert not fix.levelled and fix.offset.tolist() == [1.0, 2.0, 3.0] and fix.covariance is None
+    frd = read_usbl_data(usbl(xyz__x=1.0, xyz__y=2.0, xyz__z=3.0), relative_axes='frd')
+    assert frd.offset.tolist() == [1.0, -2.0, -3.0]
+    assert reason(read_usbl_data, usbl()) == 'no_position'
+
+
+def test_a_simulated_beacon_is_forward_starboard_down():
+    message = driver_message(
+        'stonefish_ros2/msg/BeaconInfo', header__stamp__sec=7, beacon_id=8,
+        relative_position__x=30.0, relative_position__y=4.0, relative_position__z=5.0,
+    )  # fmt: skip
+    fix = read_beacon(message)
+    assert fix.offset.tolist() == [30.0, -4.0, -5.0] and fix.target_id == 8
+    nothing = driver_message('stonefish_ros2/msg/BeaconInfo', header__stamp__sec=7)
+    assert reason(read_beacon, nothing) == 'no_position'
+
+
+@pytest.mark.parametrize(
+    'axes, turn, levelled',
+    [
+        ('flu', np.eye(3), False),
+        ('frd', np.diag([1.0, -1.0, -1.0]), False),
+        ('enu', np.eye(3), True),
+        ('ned', np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), True),
     ],
 )
-def test_a_start_that_cannot_be_used_is_refused(given, code):
-    assert reason(read_start, start_message(**given)) == code
+def test_axes_are_as_told(axes, turn, levelled):
+    vector = ros_message(
+        'geometry_msgs/msg/Vector3Stamped',
+        vector=ros_message('geometry_msgs/msg/Vector3', x=1.0, y=2.0, z=3.0),
+    )
+    vector.header.stamp.sec = 7
+    fix = read_relative(vector, relative_axes=axes)
+    assert fix.offset == pytest.approx(turn @ [1.0, 2.0, 3.0]) and fix.levelled == levelled
+    assert fix.target_id == NOBODY and fix.covariance is None
+    C = np.array([[4.0, 1.0, 0.5], [1.0, 9.0, 0.2], [0.5, 0.2, 16.0]])
+    fix = RelativeFix(stamp_ns=SEVENTH, offset=(1.0, 2.0, 3.0), covariance=C, frame_id='usbl')
+    turned = read_relative(write_relative(fix, ros_message), relative_axes=axes)
+    assert turned.frame_id == 'usbl' and turned.offset == pytest.approx(turn @ [1.0, 2.0, 3.0])
+    # The variance along any direction is that along the turned direction.
+    assert turned.covariance == pytest.approx(turn @ C @ turn.T)
+
+
+@pytest.mark.parametrize(
+    'offset, why', [((np.nan, 0, 0), 'nan'), ((2e5, 0, 0), 'out_of_range'), ((1, 2), 'bad_shape')]
+)
+def test_an_offset_that_cannot_be_is_refused(offset, why):
+    assert reason(RelativeFix, stamp_ns=SEVENTH, offset=offset) == why
+
+
+# -- the vessel ----------------------------------------------------------------------------------
+
+
+def test_a_heading_is_read_as_it_was_written_and_turned_from_ned():
+    q = np.array([0.1, -0.2, 0.5, 0.8])
+    q /= np.linalg.norm(q)
+    C = np.diag([1e-4, 2e-4, 3e-4])
+    heading = VesselHeading(stamp_ns=SEVENTH, orientation=q, covariance=C, frame_id='imu')
+    message = write_heading(heading, ros_message)
+    back = read_heading(message)
+    assert back.orientation == pytest.approx(q) and back.covariance == pytest.approx(C)
+    ned = read_heading(message, world_frame='ned')
+    assert rotation_of_quaternion(ned.orientation) == pytest.approx(
+        rotation_of_quaternion(flip_quaternion(q))
+    )
+    assert np.diag(ned.covariance) == pytest.approx([2e-4, 1e-4, 3e-4])
+
+
+@pytest.mark.filterwarnings('error')
+def test_an_imu_without_orientation_is_refused():
+    message = write_heading(
+        VesselHeading(stamp_ns=SEVENTH, orientation=(0.0, 0.0, 0.0, 1.0)), ros_message
+    )
+    assert read_heading(message).covariance is None
+    message.orientation_covariance[0] = -1.0
+    assert reason(read_heading, message) == 'no_orientation'
+    message.orientation_covariance[0] = 0.0
+    for w in (0.0, 1e300):
+        message.orientation.w = w
+        assert reason(read_heading, message) == 'bad_orientation'
+
+
+def test_a_quaternion_alone_is_a_heading_and_the_pose_of_an_odometry_that_of_the_vessel():
+    message = ros_message('geometry_msgs/msg/QuaternionStamped')
+    message.header.stamp.sec, message.quaternion.w = 7, 1.0
+    assert read_heading(message).orientation.tolist() == [0.0, 0.0, 0.0, 1.0]
+    message = ros_message('nav_msgs/msg/Odometry')
+    message.header.stamp.sec, message.pose.pose.orientation.w = 7, 1.0
+    message.pose.pose.position.x = 4.0
+    pose = read_vessel_pose(message)
+    assert isinstance(pose, VesselPose) and pose.position[0] == 4.0
+    assert read_vessel_pose(message, world_frame='ned').position.tolist() == [0.0, 4.0, 0.0]

@@ -89,21 +89,15 @@ def test_tags_are_numbers_or_their_place_in_the_list():
     assert tag_numbers([]) == {}
 
 
-def test_a_part_of_the_topic_is_a_name_and_a_part_of_that_is_none():
+def test_a_part_of_the_topic_or_a_frame_is_a_name():
     tags = {'tags': ['amy', 'bob']}
     assert label('/divers/bob/fix', fix(), **tags).target_id == 2
     assert label('/divers/bobby/fix', fix(), **tags).target_id == NOBODY
     assert label('bob/fix', fix(), **tags).target_id == 2
-
-
-def test_a_frame_is_a_name_and_then_the_frame_is_the_map():
     named = label('/fix', fix('amy'), tags=['amy'], frame_id='odom')
     assert (named.target_id, named.frame_id) == (1, 'odom')
     other = label('/fix', fix('map'), tags=['amy'])
     assert (other.target_id, other.frame_id) == (NOBODY, 'map')
-
-
-def test_what_a_message_says_itself_stays():
     assert label('/bob/fix', fix(target_id=40), tags=['bob']).target_id == 40
     assert label('/fix', fix('bob', target_id=40), tags=['bob']).frame_id == 'bob'
 
@@ -113,9 +107,6 @@ def test_sensors_are_labelled_and_scans_are_no_tags():
     labels = Labels.of('/radar/fixes', {'sensors': ['radar'], 'tags': ['amy']}, ('sensors',))
     assert labels(scan).sensor == 'radar'
     assert label('/radar/fix', fix(), sensors=['radar']).sensor == 'radar'
-
-
-def test_without_names_nothing_is_labelled():
     assert Labels.of('/bob/fix', {'tags': [], 'sensors': []}, BOTH) is None
 
 
@@ -146,20 +137,13 @@ def test_our_own_adapters_are_ours():
     assert import_with(ROOT).returncode == 0
 
 
-@pytest.mark.parametrize(
-    'content',
-    [
-        '',
-        "__owner__ = 'someone'\n__version__ = '9'\n",
-        "__owner__ = 'sonar_imm'\n__version__ = '0.0.0'\n",
-        None,
-    ],
-)
+@pytest.mark.parametrize('content', ['', "'someone'", "'sonar_imm'", None])
 def test_foreign_adapters_are_refused_and_both_places_named(tmp_path, content):
     foreign = tmp_path / 'msg_adapters'
     foreign.mkdir()
     if content is not None:
-        (foreign / '__init__.py').write_text(content)
+        text = f"__owner__ = {content}\n__version__ = '0.0.0'\n" if content else ''
+        (foreign / '__init__.py').write_text(text)
         path = [str(tmp_path), ROOT]
     else:  # a folder without __init__.py is a module too when nothing better is found
         if any((Path(folder) / 'msg_adapters').is_dir() for folder in site.getsitepackages()):

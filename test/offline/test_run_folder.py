@@ -10,16 +10,21 @@
 
 import csv
 import json
+import os
+from pathlib import Path
 import re
+import shutil
+import signal
 
-from helpers.commands import contents
 from helpers.dive_bags import write_dive
 from helpers.dive_scenes import single_run, START_NS
 from helpers.estimates import same
 import numpy as np
 import pytest
 
+from sonar_imm import files
 from sonar_imm.estimates import Estimate
+from sonar_imm.files import MARKER, mount_points, remove_leftovers, UNFINISHED
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.offline.run_folder import (
     CsvTable,
@@ -28,7 +33,7 @@ from sonar_imm_tools.offline.run_folder import (
     ParquetTable,
     RunFolder,
 )
-from sonar_imm_tools.recordings.reader import BagError
+from sonar_imm_tools.recordings.sources import BagError
 
 ESTIMATES = single_run(count=20)[0]
 
@@ -41,18 +46,15 @@ def folder(tmp_path):
 
 
 def test_estimates_come_back_bit_for_bit(folder):
-    assert folder.write_estimates(ESTIMATES, 'diver') == {
-        'first_stamp_ns': ESTIMATES[0].stamp_ns,
-        'estimates': 20,
-        'rows': 20,
-    }
+    said = folder.write_estimates(ESTIMATES, 'diver')
+    assert said == {'first_stamp_ns': ESTIMATES[0].stamp_ns, 'estimates': 20, 'rows': 20}
     for read, written in zip(folder.read_estimates(), ESTIMATES, strict=True):
         np.testing.assert_array_equal(read.state, written.state)
         np.testing.assert_array_equal(read.covariance, written.covariance)
         np.testing.assert_array_equal(read.extras['nis'], written.extras['nis'])
 
 
-def test_the_csv_has_the_columns_of_the_contract_and_exact_numbers(folder):
+def test_the_csv_has_the_columns_of_the_contract_and_exact_numbers(folder, tmp_path):
     folder.write_estimates(ESTIMATES, 'diver')
     with (folder.path / 'estimate.csv').open(newline='') as file:
         rows = list(csv.DictReader(file))
@@ -60,23 +62,21 @@ def test_the_csv_has_the_columns_of_the_contract_and_exact_numbers(folder):
     assert int(rows[0]['stamp_ns']) == START_NS
     assert [float(row['px']) for row in rows] == [estimate.state[0, 0] for estimate in ESTIMATES]
     assert rows[0]['track_id'] == '7'
+    with CsvTable(tmp_path / 'table.csv') as table:
+        table.write(1, {'a': np.zeros(2)})
+        with pytest.raises(ValueError, match='columns change'):
+            table.write(2, {'b': np.zeros(2)})
 
 
-def test_the_same_estimates_make_the_same_bytes(tmp_path):
-    contents = []
-    for name in ('a', 'b'):
-        folder = RunFolder(tmp_path / name)
-        folder.path.mkdir()
-        folder.write_estimates(ESTIMATES, 'diver')
-        contents.append(
-            {path.name: path.read_bytes() for path in folder.path.rglob('*') if path.is_file()}
-        )
-    assert contents[0] == contents[1] and len(contents[0]) == 3
-
-
-def test_no_estimates_leave_a_readable_run(folder):
+def test_no_estimates_leave_a_readable_run_and_the_same_the_same_bytes(folder, tmp_path):
     folder.write_estimates([], 'diver')
     assert folder.read_estimates() == []
+    made = []
+    for name in ('a', 'b'):
+        (tmp_path / name).mkdir()
+        RunFolder(tmp_path / name).write_estimates(ESTIMATES, 'diver')
+        made.append(contents(tmp_path / name))
+    assert made[0] == made[1] and len(made[0]) == 3
 
 
 def test_an_earlier_run_is_kept_unless_told_otherwise(folder):
@@ -90,11 +90,8 @@ def test_an_earlier_run_is_kept_unless_told_otherwise(folder):
     with pytest.raises(KeyError), folder.fresh(overwrite=True) as unfinished:
         unfinished.write_json('run.json', {'new': 1})
         raise KeyError
-    assert contents(folder.path) == {
-        '.sonar_imm': marker,
-        'notes.txt': b'mine',
-        'run.json': b'{}\n',
-    }
+    kept = {'.sonar_imm': marker, 'notes.txt': b'mine', 'run.json': b'{}\n'}
+    assert contents(folder.path) == kept
     with folder.fresh(overwrite=True) as unfinished:
         unfinished.write_json('run.json', {'new': 1})
         assert contents(folder.path)['run.json'] == b'{}\n'
@@ -108,58 +105,40 @@ def test_a_file_is_no_folder(tmp_path):
         RunFolder(tmp_path / 'file').fresh().__enter__()
 
 
-@pytest.mark.parametrize(
-    'text',
-    [
-        '',
-        '{',
-        '[]',
-        '{"system": "diver"}',
-        '3',
-        '{"system": "whale", "bag": "", "topics": {}, "parameters": 0}',
-        '{"system": [], "bag": "", "topics": {}, "parameters": 0}',
-    ],
-)
+@pytest.mark.parametrize('text', ['', '{', '[]', '3', '{"system": "diver"}'])
 def test_a_broken_run_json_is_one_sentence(folder, text):
+    with pytest.raises(BagError, match='no finished run'):
+        folder.read_run()
     (folder.path / 'run.json').write_text(text)
     with pytest.raises(BagError, match='cannot be understood'):
         folder.read_run()
 
 
 GOOD_RUN = {
-    'system': 'diver',
-    'bag': '',
-    'topics': {'/fix': 'fix'},
-    'parameters': {},
-    'counts': {'used': 1},
+    'system': 'diver', 'bag': '', 'topics': {'/fix': 'fix'}, 'parameters': {}, 'versions': {},
+    'counts': {'used': 1}, 'world_frame': 'enu',
     'refused': {'nan': {'count': 1, 'example': 'it is not a number'}},
-    'versions': {},
-    'world_frame': 'enu',
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize('name', GOOD_RUN)
-@pytest.mark.parametrize('value', [None, 5, True, [], ['a'], {'a': []}])
+@pytest.mark.parametrize('value', [None, 5, True, [], ['a'], {'a': []}, 'whale'])
 def test_entries_of_a_wrong_kind_are_one_sentence(folder, name, value):
     folder.write_json('run.json', GOOD_RUN)
     assert folder.read_run() == GOOD_RUN
     folder.write_json('run.json', {**GOOD_RUN, name: value})
-    if isinstance(value, dict) and name in ('parameters', 'counts', 'versions'):
+    if (name, value) == ('bag', 'whale') or (
+        isinstance(value, dict) and name in ('parameters', 'counts', 'versions')
+    ):
         folder.read_run()  # what is in them is judged where it is used
         return
     with pytest.raises(BagError, match='cannot be understood'):
         folder.read_run()
 
 
-def test_an_unfinished_run_is_told(tmp_path):
-    with pytest.raises(BagError, match='no finished run'):
-        RunFolder(tmp_path).read_run()
-
-
 def test_json_never_holds_nan():
-    text = json.dumps(
-        finite({'a': [float('nan'), 1.0, (float('inf'),)], 'b': {'c': 'x'}}), allow_nan=False
-    )
+    given = {'a': [float('nan'), 1.0, (float('inf'),)], 'b': {'c': 'x'}}
+    text = json.dumps(finite(given), allow_nan=False)
     assert json.loads(text) == {'a': [None, 1.0, [None]], 'b': {'c': 'x'}}
 
 
@@ -172,13 +151,6 @@ def test_a_fingerprint_notices_one_changed_byte(tmp_path):
 
 
 # The tables of a run as CSV and as Parquet say the same.
-
-
-def test_columns_may_not_change(tmp_path):
-    with CsvTable(tmp_path / 'table.csv') as table:
-        table.write(1, {'a': np.zeros(2)})
-        with pytest.raises(ValueError, match='columns change'):
-            table.write(2, {'b': np.zeros(2)})
 
 
 def test_parquet_has_the_columns_types_and_numbers_of_the_csv(tmp_path):
@@ -275,9 +247,8 @@ def test_a_run_says_how_large_it_is_and_how_fast_it_was(tmp_path, capsys):
     assert read == pytest.approx(run['bag_bytes'] * 1e-6)
     p50, p99, total = (run['timings'][f'tracker_{name}_ms'] for name in ('p50', 'p99', 'total'))
     assert 0.0 < p50 <= p99 <= total < 1e3 * run['timings']['wall_s']
-    assert re.search(
-        r'^  0\.\d+ MB read at \S+ MB/s, 0\.\d+ MB written$', capsys.readouterr().out, re.M
-    )
+    said = r'^  0\.\d+ MB read at \S+ MB/s, 0\.\d+ MB written$'
+    assert re.search(said, capsys.readouterr().out, re.M)
 
 
 def test_without_pyarrow_it_is_said_at_once(tmp_path, capsys, monkeypatch):
@@ -285,3 +256,293 @@ def test_without_pyarrow_it_is_said_at_once(tmp_path, capsys, monkeypatch):
     assert main(['track', str(write_dive(tmp_path / 'a')), str(tmp_path / 'o'), '--parquet']) == 2
     assert "pip install 'sonar_imm[parquet]'" in capsys.readouterr().err
     assert not (tmp_path / 'o').exists()
+
+
+# -- overwriting replaces only folders that this package made, as a whole, not through links
+
+
+OLD, NEW = single_run(count=3)[0], single_run(count=5)[0]
+RECORD = {'system': 'diver', 'bag': '', 'topics': {}, 'parameters': {}}
+STEPS = ('rename', 'replace', 'fsync', 'mkdir', 'unlink', 'rmdir', 'open')
+
+
+def make(path, estimates, *, overwrite=False, inputs=()):
+    """A run of `estimates` at `path`."""
+    with RunFolder(path).fresh(overwrite=overwrite, inputs=inputs) as folder:
+        folder.write_estimates(estimates, 'diver')
+        folder.write_json('run.json', {**RECORD, 'estimates': len(estimates)})
+
+
+def contents(folder):
+    """Texts of links and bytes of files by path."""
+    return {
+        path.relative_to(folder).as_posix(): os.readlink(path)
+        if path.is_symlink()
+        else path.read_bytes()
+        for path in sorted(folder.rglob('*'))
+        if path.is_symlink() or path.is_file()
+    }
+
+
+@pytest.fixture(scope='module')
+def whole_runs(tmp_path_factory):
+    """The contents of the old and of the new run."""
+    folder = tmp_path_factory.mktemp('whole')
+    for name, estimates in (('old', OLD), ('new', NEW)):
+        make(folder / name / 'out', estimates)
+    return contents(folder / 'old' / 'out'), contents(folder / 'new' / 'out')
+
+
+@pytest.fixture
+def out(tmp_path):
+    """A folder with a run, a note of the user and a link of the user."""
+    out = tmp_path / 'out'
+    make(out, OLD)
+    (out / 'notes').mkdir()
+    (out / 'notes' / 'mine.txt').write_text('mine')
+    (out / 'elsewhere').symlink_to(tmp_path)
+    return out
+
+
+def is_whole(out, run):
+    """Whether `out` holds a run and all that is the user's, and nothing else but markers of
+    unfinished folders that could not be removed."""
+    found = {k: v for k, v in contents(out).items() if not (UNFINISHED in k and MARKER in k)}
+    return found == {**run, 'notes/mine.txt': b'mine', 'elsewhere': str(out.parent)}
+
+
+def test_what_is_the_users_comes_along(out, whole_runs):
+    make(out, NEW, overwrite=True)
+    assert is_whole(out, whole_runs[1])
+    assert os.listdir(out.parent) == ['out']
+
+
+def test_a_run_whose_estimate_is_a_link_is_replaced_and_its_target_stays(out, tmp_path):
+    shutil.move(out / 'estimate', tmp_path / 'disk2')
+    (out / 'estimate').symlink_to(tmp_path / 'disk2')
+    kept = contents(tmp_path / 'disk2')
+    make(out, NEW, overwrite=True)
+    assert len(RunFolder(out).read_estimates()) == 5 and not (out / 'estimate').is_symlink()
+    assert contents(tmp_path / 'disk2') == kept
+
+
+def failing(monkeypatch, number, act):
+    """Have the `number`-th call that changes something on the disk end in `act()`."""
+    left = [number]
+
+    def wrapped(call, name):
+        def changed(*arguments, **options):
+            changes = name != 'open' or (
+                len(arguments) > 1 and arguments[1] & (os.O_WRONLY | os.O_RDWR)
+            )
+            if changes:
+                left[0] -= 1
+                if left[0] == 0:
+                    act()
+            return call(*arguments, **options)
+
+        return changed
+
+    for name in STEPS:
+        monkeypatch.setattr(os, name, wrapped(getattr(os, name), name))
+    return left
+
+
+def each_step(out, new, attempt):
+    """Make a run anew, `attempt(number)` ends in its `number`-th step, until that has none; the
+    run has to be the old or the new one whole. attempt: gives whether it ended."""
+    old = contents(out)
+    shutil.copytree(out, out.parent / 'kept', symlinks=True)
+    number, ends, ended = 0, set(), True
+    while ended:
+        number += 1
+        ended = attempt(number)
+        # What is the user's may wait in the folder of an unfinished command for the next one.
+        remove_leftovers(out)
+        ends.add(is_whole(out, new))
+        if is_whole(out, new):
+            shutil.rmtree(out)
+            shutil.copytree(out.parent / 'kept', out, symlinks=True)
+        found = {k: v for k, v in contents(out).items() if not (UNFINISHED in k and MARKER in k)}
+        assert found == old, number
+    assert number > 20 and ends == {True, False}
+
+
+@pytest.mark.parametrize(
+    ('linked', 'error'),
+    [
+        (False, OSError(28, 'No space left on device')),
+        (True, OSError(30, 'Read-only file system')),
+    ],
+)
+def test_a_failure_at_each_step_leaves_the_old_or_the_new_whole(
+    out, tmp_path, whole_runs, monkeypatch, linked, error
+):
+    if linked:
+        shutil.move(out / 'estimate', tmp_path / 'disk2')
+        (out / 'estimate').symlink_to(tmp_path / 'disk2')
+
+    def fail():
+        raise error
+
+    def attempt(number):
+        with monkeypatch.context() as patches:
+            left = failing(patches, number, fail)
+            try:
+                make(out, NEW, overwrite=True)
+            except (OSError, BagError) as caught:
+                assert error.strerror in str(caught)
+        return left[0] <= 0
+
+    each_step(out, whole_runs[1], attempt)
+    assert not linked or contents(tmp_path / 'disk2')
+
+
+def killed_in(number, change):
+    """Whether a process that makes `change()` is killed in its `number`-th step."""
+    if not (child := os.fork()):
+        failing(pytest.MonkeyPatch(), number, lambda: os.kill(os.getpid(), signal.SIGKILL))
+        change()
+        os._exit(0)
+    return os.waitpid(child, 0)[1] != 0
+
+
+def test_a_kill_at_each_step_leaves_the_old_or_the_new_whole(out, tmp_path, whole_runs):
+    def attempt(number):
+        killed = killed_in(number, lambda: make(out, NEW, overwrite=True))
+        # Any command that reads or writes the run finds it.
+        assert RunFolder(out).read_run()['estimates'] in (3, 5), number
+        remove_leftovers(out)
+        left = [path for path in tmp_path.iterdir() if UNFINISHED in path.name]
+        for path in left:  # one that was killed before its marker; it is empty
+            path.rmdir()
+        return killed
+
+    each_step(out, whole_runs[1], attempt)
+
+
+def test_a_kill_while_a_run_moves_into_a_folder_of_the_user_is_repaired(tmp_path, whole_runs):
+    out = tmp_path / 'out'
+    number, killed = 0, True
+    while killed:
+        number += 1
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        (out / 'mine.txt').write_text('mine')
+        killed = killed_in(number, lambda: make(out, NEW))
+        try:
+            make(out, NEW)
+        except BagError as error:  # what is there counts as ours
+            assert '--overwrite' in str(error)
+            make(out, NEW, overwrite=True)
+        found = {k: v for k, v in contents(out).items() if UNFINISHED not in k}
+        assert found == {**whole_runs[1], 'mine.txt': b'mine'}, number
+    assert number > 20
+
+
+def test_a_folder_that_others_made_is_not_replaced(tmp_path):
+    out = tmp_path / 'out'
+    out.mkdir()
+    for name in ('estimate.csv', 'report.html', 'metrics.json'):
+        (out / name).write_text('mine')
+    (out / 'estimate').mkdir()
+    (out / 'estimate' / 'thesis.tex').write_text('mine')
+    before = contents(out)
+    with pytest.raises(BagError, match=r'no results folder that sonar-imm made .*\.sonar_imm'):
+        make(out, NEW, overwrite=True)
+    (out / MARKER).symlink_to(tmp_path)
+    with pytest.raises(BagError, match='no results folder'):
+        make(out, NEW, overwrite=True)
+    (out / MARKER).unlink()
+    (out / MARKER).write_text(json.dumps({'made_by': 'sonar_imm', 'kind': 'survey'}))
+    with pytest.raises(BagError, match='holds a survey, not a results'):
+        make(out, NEW, overwrite=True)
+    (out / MARKER).unlink()
+    assert contents(out) == before and os.listdir(tmp_path) == ['out']
+
+
+def test_what_lies_in_the_bag_of_a_run_is_not_deleted(out):
+    (out / 'estimate' / 'thesis.tex').write_text('mine')
+    with pytest.raises(BagError, match='estimate holds thesis.tex, which is of no run'):
+        make(out, NEW, overwrite=True)
+    assert (out / 'estimate' / 'thesis.tex').read_text() == 'mine'
+
+
+def test_runs_of_versions_without_markers_are_known_by_their_run_json(out, whole_runs):
+    (out / MARKER).unlink()
+    RunFolder(out).write_json('run.json', {**RECORD, 'versions': {'sonar_imm': '0.9'}})
+    make(out, NEW, overwrite=True)
+    assert is_whole(out, whole_runs[1])
+
+
+@pytest.mark.parametrize(
+    ('name', 'words'),
+    [
+        ('link', 'is a link to'), ('file', 'is a file'), ('fifo', 'is a file'),
+        ('.', 'the current folder'), ('..', 'the current folder'), ('home', 'your home folder'),
+        ('bag', 'is a recording'), ('parent', 'which is being read'),
+        ('mount', 'is a mount point'),
+    ],
+)  # fmt: skip
+def test_odd_places_are_one_sentence_and_stay(out, tmp_path, monkeypatch, name, words):
+    (tmp_path / 'link').symlink_to(out)
+    (tmp_path / 'file').write_text('mine')
+    os.mkfifo(tmp_path / 'fifo')
+    target = tmp_path / name if name in ('link', 'file', 'fifo') else out
+    if name in ('.', '..'):
+        monkeypatch.chdir(out if name == '.' else out / 'notes')
+        target = Path(name)
+    elif name == 'home':
+        monkeypatch.setenv('HOME', str(out))
+    elif name == 'bag':
+        target = out / 'estimate'
+    elif name == 'mount':
+        monkeypatch.setattr(files, 'mount_points', lambda place: [place / 'estimate'])
+    before = contents(out)
+    inputs = [out / 'estimate'] if name in ('bag', 'parent') else []
+    with pytest.raises(BagError, match=words):
+        make(target, NEW, overwrite=True, inputs=inputs)
+    assert contents(out) == before
+    assert 'is the root of all folders' in files.hindrance(Path('/'), 'results')
+
+
+def test_mount_points_are_those_of_the_system():
+    assert Path('/') in mount_points(Path('/')) and Path('/proc') in mount_points(Path('/proc'))
+    assert mount_points(Path(__file__)) == []
+
+
+@pytest.mark.parametrize('made', ['nothing', 'marker of a run', 'marker of another folder'])
+def test_folders_of_the_user_that_look_unfinished_are_never_removed(out, made):
+    mine = out.parent / f'out{UNFINISHED}2024'
+    if made == 'nothing':
+        mine.mkdir()
+    elif made == 'marker of a run':
+        shutil.copytree(out, mine, symlinks=True)
+    else:
+        with files.beside(out.parent / 'out') as place:
+            shutil.copytree(place, mine)
+    (mine / 'thesis.tex').write_text('mine')
+    before = contents(mine)
+    inside = out / f'run{UNFINISHED}2024'
+    inside.mkdir()
+    (inside / 'thesis.tex').write_text('mine')
+    make(out, NEW, overwrite=True)
+    assert contents(mine) == before and (inside / 'thesis.tex').exists()
+
+
+def test_a_link_that_looks_unfinished_is_not_followed(out, tmp_path):
+    with files.beside(out) as place:
+        shutil.copytree(place, tmp_path / 'target')
+    (tmp_path / place.name).symlink_to(tmp_path / 'target')
+    remove_leftovers(out)
+    assert (tmp_path / 'target' / MARKER).exists() and (tmp_path / place.name).is_symlink()
+
+
+def test_metrics_are_not_written_through_a_link(out, tmp_path):
+    """A folder from others may hold links to files of the user."""
+    (tmp_path / 'mine.txt').write_text('mine')
+    (out / 'metrics.json').symlink_to(tmp_path / 'mine.txt')
+    RunFolder(out).write_json('metrics.json', {'a': 1})
+    assert (tmp_path / 'mine.txt').read_text() == 'mine'
+    assert json.loads((out / 'metrics.json').read_text()) == {'a': 1}
+    assert not (out / 'metrics.json').is_symlink()

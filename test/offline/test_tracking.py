@@ -8,13 +8,28 @@
 
 """Offline runs: the last word on each stamp, refusals, order, smoothing."""
 
+import json
+from multiprocessing import synchronize
+import os
+import socket
+import subprocess
+import sys
+import time
+
 from helpers.dive_bags import write_dive
-from helpers.dive_scenes import estimate_at, SECOND, START_NS
+from helpers.dive_scenes import estimate_at, legs, SECOND, START_NS
+from helpers.dying import work
+from helpers.source import ROOT
 import numpy as np
 import pytest
 
+from sonar_imm.measurements import NOBODY
+from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.offline import jobs
+from sonar_imm_tools.offline.initial import read_initial
+from sonar_imm_tools.offline.jobs import cluster, processes, workers
 from sonar_imm_tools.offline.tracking import final_estimates, InputOptions, OfflineRun, Revisions
 from sonar_imm_tools.recordings.convert import convert_fixes
 from sonar_imm_tools.recordings.reader import BagError, BagReader
@@ -33,46 +48,29 @@ def seconds_and_px(estimates):
     ]
 
 
-def test_the_last_word_on_a_stamp_wins_and_stamps_come_in_order():
+def test_the_last_word_on_a_stamp_wins_and_what_can_no_longer_change_is_let_go():
     revisions = Revisions(10 * SECOND)
     final = revisions.add([made(1, 1.0)]) + revisions.add([made(3, 1.0)])
     final += revisions.add([made(2, 5.0), made(3, 2.0)])
     assert final == []
     assert seconds_and_px(revisions.finish()) == [(1, 1.0), (2, 5.0), (3, 2.0)]
-
-
-def test_what_can_no_longer_change_is_let_go():
     revisions = Revisions(2 * SECOND)
-    final = [seconds_and_px(revisions.add([made(k)])) for k in range(5)]
-    assert final == [[], [], [], [(0, 0.0)], [(1, 0.0)]]
-
-
-def test_memory_does_not_grow_with_the_recording():
-    revisions = Revisions(2 * SECOND)
-    for k in range(1000):
-        revisions.add([made(k)])
-    assert len(revisions.finish()) == 3
-
-
-def test_a_restarted_clock_begins_anew_and_loses_nothing():
+    final = [seconds_and_px(revisions.add([made(k)])) for k in range(1000)]
+    assert final[:5] == [[], [], [], [(0, 0.0)], [(1, 0.0)]] and len(revisions.finish()) == 3
     revisions = Revisions(2 * SECOND)
     final = [item for k in (100, 101, 5, 6) for item in revisions.add([made(k)])]
-    assert seconds_and_px([*final, *revisions.finish()]) == [
-        (100, 0.0),
-        (101, 0.0),
-        (5, 0.0),
-        (6, 0.0),
-    ]
+    found = seconds_and_px([*final, *revisions.finish()])
+    assert found == [(k, 0.0) for k in (100, 101, 5, 6)]
 
 
 def test_order_by_stamp_makes_late_input_punctual(tmp_path):
-    with BagReader(write_dive(tmp_path / 'dive', shuffle=True)) as bag:
+    with BagReader(write_dive(tmp_path / 'dive', shuffle=True, count=40)) as bag:
         run = OfflineRun(bag, DIVER, CONFIG, InputOptions(order='stamp'))
         list(run.estimates())
     assert 'late' not in run.outcomes()
 
 
-def test_refused_messages_are_counted_with_their_reason(tmp_path):
+def test_refused_messages_are_counted_with_their_reason_and_repairs_told(tmp_path, monkeypatch):
     with BagReader(write_dive(tmp_path / 'dive', spoilt=(3, 4))) as bag:
         run = OfflineRun(bag, DIVER, CONFIG)
         advanced = []
@@ -82,15 +80,8 @@ def test_refused_messages_are_counted_with_their_reason(tmp_path):
     assert run.outcomes() == {'used': 118, 'refused': 2}
     assert not run.failure()
     assert sum(advanced) == run.total == run.messages == 120
-
-
-def test_repaired_covariances_are_told_with_the_counts(tmp_path, monkeypatch):
-    with BagReader(write_dive(tmp_path / 'dive')) as bag:
-        run = OfflineRun(bag, DIVER, CONFIG)
-        list(run.estimates())
-        assert 'covariance_repairs' not in run.outcomes()
-        monkeypatch.setattr(run.tracker, 'health', lambda: {'covariance_repairs': 3})
-        assert run.outcomes() == {'covariance_repairs': 3, 'used': 120}
+    monkeypatch.setattr(run.tracker, 'health', lambda: {'covariance_repairs': 3})
+    assert run.outcomes() == {'covariance_repairs': 3, 'used': 118, 'refused': 2}
 
 
 def test_the_expected_frame_refuses_the_others(tmp_path):
@@ -102,22 +93,19 @@ def test_the_expected_frame_refuses_the_others(tmp_path):
 
 
 def test_topics_can_be_named(tmp_path):
-    with BagReader(write_dive(tmp_path / 'dive', topic='/usbl/pose')) as bag:
+    with BagReader(write_dive(tmp_path / 'dive', topic='/usbl/pose', count=30)) as bag:
         with pytest.raises(BagError, match='no topic for the diver tracker'):
             OfflineRun(bag, DIVER, CONFIG)
         run = OfflineRun(bag, DIVER, CONFIG, InputOptions(topics={'/usbl/pose': 'fix'}))
-        assert len(list(run.estimates())) == 120
+        assert len(list(run.estimates())) == 30
 
 
 def test_the_smoother_is_nearer_to_the_truth(tmp_path):
-    from helpers.dive_scenes import legs
-
     errors = {}
     for smooth in (False, True):
         with BagReader(write_dive(tmp_path / f'dive{smooth}')) as bag:
-            estimates = list(
-                OfflineRun(bag, DIVER, CONFIG, InputOptions(smooth=smooth)).estimates()
-            )
+            run = OfflineRun(bag, DIVER, CONFIG, InputOptions(smooth=smooth))
+            estimates = list(run.estimates())
         rows = [estimate for estimate in estimates if len(estimate)]
         times = np.array([(row.stamp_ns - START_NS) / SECOND for row in rows])
         place = np.array([row.state[0, :2] for row in rows])
@@ -164,7 +152,7 @@ def log(path, truth, rng, name, std=STD, wild=0.05):
     path.write_text('\n'.join([head, *rows]) + '\n')
 
 
-def tracked(folder, **options):
+def errors_of(folder, **options):
     """Errors (k,) of the first confirmed track after ten fixes, whether the 95 % ellipse held the
     diver, and what the tracker warns of at the end and after 40 fixes."""
     error, inside, number = [], [], 0
@@ -195,7 +183,7 @@ def tracked(folder, **options):
 
 @pytest.mark.parametrize('name', ['', 'Diver 1'])
 def test_wild_fixes_are_not_believed_with_and_without_names(tmp_path, name):
-    rmse, inside, warnings, _ = tracked(tmp_path, name=name)
+    rmse, inside, warnings, _ = errors_of(tmp_path, name=name)
     assert rmse <= 1.35 and inside > 0.9
     assert not any('as large as reported' in text for text in warnings)
 
@@ -203,7 +191,7 @@ def test_wild_fixes_are_not_believed_with_and_without_names(tmp_path, name):
 @pytest.mark.statistics
 @pytest.mark.parametrize('name', ['', 'Diver 1'])
 def test_fixes_that_scatter_five_times_too_far_are_named_before_the_fiftieth(tmp_path, name):
-    _, inside, _, early = tracked(tmp_path, name=name, std=STD / 5.0, wild=0.0)
+    _, inside, _, early = errors_of(tmp_path, name=name, std=STD / 5.0, wild=0.0)
     # Over 20 runs .80.
     assert inside > 0.7
     assert any('as large as reported' in text for text in early)
@@ -216,11 +204,11 @@ def test_pings_that_are_shared_out_over_processes_give_the_same_estimates(tmp_pa
     assert main([*scene, *(word for each in small for word in ('--set', each))]) == 0
     system = SYSTEMS['bathymetry']
     made = []
-    for jobs in (1, 2):
+    for count in (1, 2):
         with BagReader(bag) as reader:
-            options = InputOptions(jobs=jobs)
+            options = InputOptions(jobs=count)
             offline = OfflineRun(reader, system, system.config_type()(), options)
-            if jobs > 1:  # nothing is done here
+            if count > 1:  # nothing is done here
                 monkeypatch.setattr(offline, '_in_turn', None)
             made.append(list(offline.estimates()))
             assert len(made[-1]) == 6 and offline.outcomes()['used'] == 6
@@ -229,3 +217,165 @@ def test_pings_that_are_shared_out_over_processes_give_the_same_estimates(tmp_pa
         assert (alone.stamp_ns, alone.source) == (shared.stamp_ns, shared.source)
         np.testing.assert_array_equal(alone.state, shared.state)
         np.testing.assert_array_equal(alone.probabilities, shared.probabilities)
+
+
+# -- starts of tracks from a file
+
+
+DIVER = SYSTEMS['diver']
+MESSAGE = f"""
+header: {{stamp: {{sec: 1700000003, nanosec: 500000000}}, frame_id: map}}
+pose:
+  pose: {{position: {{x: 2.0, y: -3.5, z: 0.0}}, orientation: {{w: 1.0}}}}
+  covariance: [4, 0.5, 0, 0, 0, 0, 0.5, 9, 0, 0, 0, 0, {', '.join(['0'] * 24)}]
+"""
+
+
+HERE = {'position': [0.0, 0.0], 'covariance': [4, 0, 0, 4]}
+
+
+def written(tmp_path, text, name='places.yaml'):
+    path = tmp_path / name
+    path.write_text(text, encoding='utf-8')
+    return path
+
+
+def test_yaml_json_and_the_message_say_the_same(tmp_path):
+    place = {'position': [2.0, -3.5], 'covariance': [[4, 0.5], [0.5, 9]], 'frame_id': 'map'}
+    place['time'] = 1_700_000_003.5
+    texts = [MESSAGE, json.dumps(place), json.dumps([place])]
+    texts += [json.dumps({**place, 'time': '2023-11-14T22:13:23.5Z'})]
+    for flat in ([4, 0.5, 0.5, 9], [4, 0.5, 0, 0.5, 9, 0, 0, 0, 1]):
+        texts.append(json.dumps({**place, 'covariance': flat}))
+    found = [read_initial(written(tmp_path, text)) for text in texts]
+    assert all(each == found[0] for each in found)
+    start = found[0][0].start(0, {})
+    assert start.stamp_ns == 1_700_000_003 * SECOND + SECOND // 2
+    assert start.position.tolist() == [2.0, -3.5, 0.0] and start.target_id == NOBODY
+    np.testing.assert_allclose(start.covariance[:2, :2], [[4.0, 0.5], [0.5, 9.0]])
+
+
+@pytest.mark.parametrize(
+    'text, words',
+    [
+        ('', 'the file is empty'),
+        ('[]', 'the file is empty'),
+        ('3', 'a place needs position and covariance'),
+        ('{position: [1, 2]}', 'covariance is missing'),
+        ('{covariance: [1, 0, 0, 1]}', 'position is missing'),
+        ('{position: [1], covariance: [1, 0, 0, 1]}', 'two or three numbers'),
+        ('{position: [1, .nan], covariance: [1, 0, 0, 1]}', 'not finite'),
+        ('{position: [1, two], covariance: [1, 0, 0, 1]}', "'two' in place of a number"),
+        ('{position: [1, 2], covariance: [1, 0, 0]}', '4, 9 or 36 numbers'),
+        ('{position: [1, 2], covariance: [0, 0, 0, 0]}', 'covariance'),
+        ('{position: [1, 2], covariance: [1, 5, 5, 1]}', 'covariance'),
+        ('{position: [1, 2], covariance: [1, 0, 0, 1], time: noon}', "time 'noon'"),
+        ('{position: [1, 2], covariance: [1, 0, 0, 1], where: here}', 'where is not one of'),
+        ('[{position: [1, 2], covariance: [1, 0, 0, 1]}, 7]', 'place 2:'),
+        ('{position: [1, 2', 'not a YAML file'),
+        ('pose: 3', 'pose needs'),
+    ],
+)
+def test_a_bad_file_gets_one_sentence(tmp_path, text, words):
+    with pytest.raises(ConfigError, match='--initial') as caught:
+        read_initial(written(tmp_path, text))
+    assert words in str(caught.value) and '\n' not in str(caught.value)
+    with pytest.raises(ConfigError, match='No such file'):
+        read_initial(tmp_path / 'nothing.yaml')
+
+
+def test_a_track_begins_where_and_when_the_file_says(tmp_path):
+    """With a name of `tags`; a start after the recording is counted as refused, an unknown name
+    before the run."""
+    places = (HERE, {**HERE, 'position': [500.0, 0.0], 'name': 'anna'})
+    path = written(tmp_path, json.dumps([*places, {**HERE, 'time': 1_800_000_000}]))
+    options = InputOptions(initial=read_initial(path))
+    with BagReader(write_dive(tmp_path / 'dive', count=30)) as bag:
+        run = OfflineRun(bag, DIVER, DIVER.config_type()(tags=('bob', 'anna')), options)
+        first = list(run.estimates())[0]
+        assert first.stamp_ns == START_NS and 2 in first.extras['target_id']
+        assert (first.extras['track_state'] == 1).any()
+        assert run.recipe()['initial'][0]['position'] == (0.0, 0.0, 0.0)
+        assert run.refusals()['outside']['count'] == 1
+        with pytest.raises(BagError, match="no target is called 'anna': bob are known"):
+            list(OfflineRun(bag, DIVER, DIVER.config_type()(tags=('bob',)), options).estimates())
+
+
+def test_the_command_takes_the_file(tmp_path, capsys):
+    bag = str(write_dive(tmp_path / 'dive', count=20))
+    path = written(tmp_path, '{position: [0, 0], covariance: [4, 0, 0, 4]}')
+    assert main(['track', bag, str(tmp_path / 'out'), '--initial', str(path)]) == 0
+    run = json.loads((tmp_path / 'out' / 'run.json').read_text(encoding='utf-8'))
+    assert run['initial'][0]['covariance'] == [4.0, 0.0, 0.0, 4.0]
+    bad = written(tmp_path, '{position: [0, 0]}', 'bad.yaml')
+    assert main(['track', bag, str(tmp_path / 'other'), '--initial', str(bad)]) != 0
+    assert 'covariance is missing' in capsys.readouterr().err
+
+
+# -- processes that share work, where they cannot
+
+
+@pytest.mark.parametrize('error', [FileNotFoundError(2, 'No such file'), OSError(38, 'Not there')])
+def test_without_shared_memory_there_is_a_sentence_that_helps(monkeypatch, error):
+    """What a semaphore costs in a container without /dev/shm."""
+
+    def refused(*args, **options):
+        raise error
+
+    monkeypatch.setattr(synchronize.SemLock, '__init__', refused)
+    with pytest.raises(OSError, match='--jobs 1'), processes(2):
+        pass
+
+
+def test_a_process_that_dies_costs_its_call_only(tmp_path):
+    with workers(2) as run:
+        found = {
+            k: (result, failure)
+            for k, result, failure in run(work, [(tmp_path, k) for k in range(6)])
+        }
+        again = list(run(work, [(tmp_path, 5)]))
+    assert {k: found[k] for k in (0, 1, 2, 5)} == {k: (k * k, '') for k in (0, 1, 2, 5)}
+    assert 'was ended' in found[3][1] and 'not this one' in found[4][1]
+    assert again == [(0, 25, '')]
+
+
+def test_one_process_does_calls_in_turn(tmp_path):
+    with workers() as run:
+        found = list(run(work, [(tmp_path, 1), (tmp_path, 4)]))
+    assert found == [(0, 1, ''), (1, None, 'ValueError: not this one')]
+
+
+def test_a_missing_scheduler_is_one_sentence(monkeypatch):
+    pytest.importorskip('distributed')
+    monkeypatch.setattr(jobs, 'CONNECT_SECONDS', 0.5)
+    with socket.create_server(('127.0.0.1', 0)) as silent:
+        address = f'127.0.0.1:{silent.getsockname()[1]}'
+        with pytest.raises(ConfigError, match=f'no dask scheduler answers at {address} '):
+            cluster(address).__enter__()
+    with pytest.raises(ConfigError, match='no dask scheduler'):  # the port is closed now
+        cluster(address).__enter__()
+    with pytest.raises(ConfigError, match='no dask scheduler at nonsense: .*port'):
+        cluster('nonsense').__enter__()
+
+
+def test_the_example_of_slurm_hands_in_its_jobs_and_cancels_them(tmp_path):
+    """By commands that stand in for those of Slurm, and keep what they are given."""
+    pytest.importorskip('dask_jobqueue')
+    (tmp_path / 'sbatch').write_text(f'#!/bin/sh\ncp $1 {tmp_path}/$$.job\necho job $$\n')
+    (tmp_path / 'scancel').write_text(f'#!/bin/sh\ntouch {tmp_path}/$1.gone\n')
+    for name in ('sbatch', 'scancel'):
+        (tmp_path / name).chmod(0o755)
+    example = subprocess.Popen(
+        [sys.executable, ROOT / 'examples' / 'howto' / 'slurm_cluster.py'], text=True,
+        env={**os.environ, 'PATH': f'{tmp_path}:{os.environ["PATH"]}'}, cwd=tmp_path,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    end = time.monotonic() + 60.0
+    while len(list(tmp_path.glob('*.job'))) < 4 and time.monotonic() < end:
+        time.sleep(0.1)
+    address = example.communicate('\n', timeout=60)[0].splitlines()[0]
+    jobs = {path.stem: path.read_text() for path in tmp_path.glob('*.job')}
+    assert len(jobs) == 4 and {path.stem for path in tmp_path.glob('*.gone')} == set(jobs)
+    for text in jobs.values():
+        assert '#SBATCH --cpus-per-task=16' in text and '. /data/venv/bin/activate' in text
+        assert f'{address} ' in text and '--nworkers 16 ' in text

@@ -13,7 +13,10 @@ import pytest
 
 from msg_adapters.fixes import write_fix
 from sonar_imm.measurements import Fix
+from sonar_imm_tools.recordings.convert import KINDS
+from sonar_imm_tools.recordings.csv_table import CsvTable
 from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.writer import BagWriter
 
 START = 1_700_000_000 * 10**9
@@ -30,22 +33,35 @@ def real_data():
 
 
 @pytest.fixture
+def table(tmp_path):
+    """A table of text or bytes."""
+
+    def make(text, **options):
+        (tmp_path / 'a.csv').write_bytes(text if isinstance(text, bytes) else text.encode())
+        return CsvTable(tmp_path / 'a.csv', CsvOptions(**options))
+
+    return make
+
+
+@pytest.fixture
+def convert(tmp_path):
+    """Write a table and make a recording of it; gives the report."""
+
+    def run(text, kind='fixes', out='out', **options):
+        (tmp_path / 'in.csv').write_text(text, encoding='utf-8')
+        return KINDS[kind](tmp_path / 'in.csv', tmp_path / out, **options)
+
+    return run
+
+
+@pytest.fixture
 def fix_message():
     """Make the message of the i-th fix, one a second."""
 
     def make(i, **changes):
-        return write_fix(
-            Fix(
-                **{
-                    'stamp_ns': START + i * 10**9,
-                    'position': (i, 2.0, 0.0),
-                    'covariance': [[4.0, 0.5], [0.5, 9.0]],
-                    'frame_id': 'map',
-                    **changes,
-                }
-            ),
-            ros_message,
-        )
+        usual = {'covariance': [[4.0, 0.5], [0.5, 9.0]], 'frame_id': 'map'}
+        place = {'stamp_ns': START + i * 10**9, 'position': (i, 2.0, 0.0)}
+        return write_fix(Fix(**{**usual, **place, **changes}), ros_message)
 
     return make
 

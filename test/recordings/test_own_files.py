@@ -11,6 +11,8 @@ error reaches the check."""
 
 import json
 
+from helpers.dive_bags import write_dive
+import numpy as np
 import pytest
 
 from sonar_imm.parameters import parameters_from_yaml
@@ -24,6 +26,7 @@ from sonar_imm_tools.recordings.own_files import (
     write_own_limit,
     write_own_parameters,
 )
+from sonar_imm_tools.recordings.sound_speed import mean_speed, MOST_POINTS, read_profile
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.simulation.fathometer.simulator import scenario as fathometer_scenario
 from sonar_imm_tools.simulation.obstacle.simulator import scenario as obstacle_scenario
@@ -34,9 +37,6 @@ def test_only_what_differs_from_the_defaults_is_told():
     assert unusual(obstacle_scenario('approach').instruments(), config) == {}
     moved = obstacle_scenario('approach', {'sonar_lever': (2.0, 0.0, -0.3), 'roll_rms_deg': 4.0})
     assert unusual(moved.instruments(), config) == {'sonar_lever': (2.0, 0.0, -0.3)}
-
-
-def test_drawn_cross_spectra_have_no_window():
     config = SYSTEMS['fathometer'].config_type()
     # The length of a snapshot, which the tracker would choose by itself, is part of the scene.
     common = {'snapshot_seconds': 1.4, 'sound_speed_std': 0.0}
@@ -113,18 +113,109 @@ def test_a_limit_and_how_a_recording_is_made_again_are_kept(tmp_path):
 @pytest.mark.parametrize(
     'text, sentence',
     [
-        ('limit: ten', 'states no number'),
-        ('limit: true', 'states no number'),
-        ('[1, 2]', 'states no number'),
-        ('', 'states no number'),
-        ('limit: .nan', 'finite'),
-        ('limit: .inf', 'finite'),
-        ('limit: -1', 'not negative'),
-        ('limit: [', 'not YAML'),
+        ('limit: ten', 'states no number'), ('limit: true', 'states no number'),
+        ('[1, 2]', 'states no number'), ('', 'states no number'), ('limit: .nan', 'finite'),
+        ('limit: .inf', 'finite'), ('limit: -1', 'not negative'), ('limit: [', 'not YAML'),
         ('\udcff\udcfe\x00limit', 'not YAML'),
     ],
-)
+)  # fmt: skip
 def test_any_other_limit_is_one_sentence(tmp_path, text, sentence):
     (tmp_path / 'check.yaml').write_text(text, errors='surrogateescape')
     with pytest.raises(BagError, match=sentence):
         own_limit(tmp_path)
+
+
+# -- profiles of the speed of sound
+
+
+DEPTH, SPEED = [0.5, 10.0, 20.0, 35.0], [1490.1, 1488.0, 1485.5, 1480.2]
+ROWS = list(zip(DEPTH, SPEED))
+UP = [(30.0, 1482.0), (9.0, 1489.0)]
+"""The way up of a cast."""
+
+
+def lines(rows, separator=' '):
+    return [separator.join(f'{value:.9g}' for value in row) for row in rows]
+
+
+FILES = {
+    'caris.svp': [
+        '[SVP_VERSION_2]', 'caris.svp', 'Section 2012-123 10:20:30 43:04:00 -070:42:00',
+        *lines(ROWS + UP), 'Section 2012-124 10:20:30 43:04:00 -070:42:00', '0 1600', '50 1600',
+    ],
+    'kongsberg.asvp': [
+        '( SoundVelocity  1.0 0 201203151200 43.06 -70.7 -1 0 0 OMS_ P 0004 )', *lines(ROWS),
+    ],
+    'seabird.cnv': [
+        '* Sea-Bird SBE19plus Data File:', '# nquan = 4', '# name 0 = prDM: Pressure [db]',
+        '# name 1 = depSM: Depth [salt water, m]', '# name 2 = t090C: Temperature [deg C]',
+        '# name 3 = svCM: Sound Velocity [Chen-Millero, m/s]', '*END*',
+        *lines([(depth * 1.01, depth, 8.0, speed) for depth, speed in ROWS + UP]),
+        ' 1 -9.990e-29 8 1500',
+    ],
+    'plain.csv': ['Depth (m),Temperature,Sound Velocity (m/s)',
+                  *(f'{depth},8,{speed}' for depth, speed in ROWS)],
+    'german.csv': ['Tiefe;Schallgeschwindigkeit',
+                   *(f'{depth};{speed}'.replace('.', ',') for depth, speed in ROWS)],
+    'bare.txt': lines(ROWS),
+    'negative.csv': ['depth,speed', *(f'{-depth},{speed}' for depth, speed in ROWS)],
+}  # fmt: skip
+
+
+def write(path, rows):
+    path.write_text('\n'.join(rows) + '\n')
+    return path
+
+
+@pytest.mark.parametrize('name', FILES)
+def test_every_format_gives_the_same_profile(tmp_path, name):
+    profile = read_profile(write(tmp_path / name, FILES[name]))
+    assert profile.depth == pytest.approx(DEPTH) and profile.speed == pytest.approx(SPEED)
+
+
+def test_duplicates_upcasts_and_spikes_go_and_a_long_cast_keeps_what_it_needs(tmp_path):
+    rows = [(0.5, 1490.0), (0.5, 1490.2), (10.0, 1488.0), (12.0, 0.0), (5.0, 1489.0), *ROWS[2:]]
+    path = write(tmp_path / 'a.asvp', ['( SoundVelocity )', *lines(rows + UP), '22 nan', 'x y'])
+    profile = read_profile(path)
+    assert profile.depth == pytest.approx([0.5, 5.0, 10.0, 20.0, 35.0])
+    assert profile.speed == pytest.approx([1490.1, 1489.0, 1488.0, 1485.5, 1480.2])
+    depth = np.linspace(0.0, 400.0, 4001)
+    speed = 1480.0 + 20.0 * np.exp(-depth / 30.0) + 0.01 * depth
+    profile = read_profile(write(tmp_path / 'a.txt', lines(zip(depth, speed))))
+    assert len(profile.depth) <= MOST_POINTS
+    assert np.abs(profile.at(depth) - speed).max() < 0.02
+
+
+def test_the_mean_is_that_of_a_vertical_path():
+    profile = read_profile.__globals__['Profile'](
+        np.array([0.0, 10.0]), np.array([1400.0, 1600.0])
+    )
+    # The integral of 1 / (1400 + 20 z) over 10 m.
+    assert mean_speed(profile) == pytest.approx(200.0 / np.log(1600.0 / 1400.0), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('rows', 'word'),
+    [
+        (['depth,temperature', '1,8'], 'no column of sound speed'),
+        (['1 2 3', '4 5 6'], 'columns without names'),
+        (['depth,speed', '1,15', '2,16'], 'between 1300 and 1700'),
+        ([''], 'no column of depth'),
+    ],
+)
+def test_what_is_no_profile_is_one_sentence(tmp_path, rows, word):
+    with pytest.raises(BagError, match=word):
+        read_profile(write(tmp_path / 'a.csv', rows))
+    with pytest.raises(BagError, match='cannot be read'):
+        read_profile(tmp_path / 'absent.svp')
+
+
+def test_track_takes_the_mean_of_a_profile_for_divers(tmp_path):
+    write_dive(tmp_path / 'bag', count=5)
+    path = write(tmp_path / 'a.svp', FILES['caris.svp'])
+    out = tmp_path / 'out'
+    assert main(['track', str(tmp_path / 'bag'), str(out), '--sound-speed', str(path)]) == 0
+    speed = json.loads((out / 'run.json').read_text())['parameters']['sound_speed']
+    assert speed == pytest.approx(mean_speed(read_profile(path)), abs=1e-3)
+    none = ('--sound-speed', str(tmp_path / 'absent.svp'))
+    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'no'), *none]) == 2

@@ -26,6 +26,7 @@ from sonar_imm_tools.recordings.writer import BagWriter
 
 FIX = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 CUSTOM = 'my_msgs/msg/Custom'
+TOPICS = 'topics_with_message_count'
 KINDS = [
     (plugin, mode)
     for plugin in StoragePlugin
@@ -111,21 +112,17 @@ class TestDefinitions:
 
 
 class TestWhole:
-    @pytest.mark.parametrize('name', ['dive.bag', 'dive.v2'])
-    def test_a_folder_of_any_name(self, write_fixes, name):
-        items, problems = read(write_fixes(3, name=name))
-        assert len(items) == 3 and not problems
-
-    @pytest.mark.parametrize('version', [8, 9])
+    @pytest.mark.parametrize('version, name', [(8, 'dive.bag'), (9, 'dive.v2')])
     @pytest.mark.parametrize('plugin, mode', KINDS)
-    def test_every_kind_of_rosbag2(self, tmp_path, fix_message, plugin, version, mode):
-        writer = Writer(tmp_path / 'bag', version=version, storage_plugin=plugin)
+    def test_every_kind_of_rosbag2(self, tmp_path, fix_message, plugin, version, name, mode):
+        """In folders of any name."""
+        writer = Writer(tmp_path / name, version=version, storage_plugin=plugin)
         writer.set_compression(mode, CompressionFormat.ZSTD)
         with writer:
             link = writer.add_connection('/fix', FIX, typestore=typestore())
             for i in range(5):
                 writer.write(link, 10 + i, typestore().serialize_cdr(fix_message(i), FIX))
-        items, problems = read(tmp_path / 'bag')
+        items, problems = read(tmp_path / name)
         assert [item.log_ns for item in items] == [10, 11, 12, 13, 14] and not problems
         assert [item.message.pose.pose.position.x for item in items] == [0, 1, 2, 3, 4]
         assert [item.index for item in items] == [0, 1, 2, 3, 4]
@@ -182,12 +179,8 @@ class TestWhole:
                     bag.write('/fix', fix_message(int(number)), log)
             shutil.copy(tmp_path / f's_{number}' / f's_{number}.mcap', split)
         items, _ = read(split)
-        assert [(item.log_ns, item.message.pose.pose.position.x) for item in items] == [
-            (30, 2),
-            (40, 10),
-            (50, 2),
-            (50, 10),
-        ]
+        found = [(item.log_ns, item.message.pose.pose.position.x) for item in items]
+        assert found == [(30, 2), (40, 10), (50, 2), (50, 10)]
         with BagReader(split) as bag:
             assert [(topic.name, topic.count) for topic in bag.topics] == [('/fix', 4)]
 
@@ -214,14 +207,13 @@ class TestOrder:
             with pytest.raises(ValueError, match='recorded, stamp'):
                 next(bag.messages(order='random'))
 
-    def test_without_decoding_the_bytes_remain(self, tmp_path, fix_message):
+    def test_without_decoding_the_bytes_remain_and_an_unknown_topic_gives_nothing(
+        self, tmp_path, fix_message
+    ):
         with BagReader(self.late(tmp_path, fix_message)) as bag:
             item = next(bag.messages(['/note'], decode=False))
             assert item.message is None
             assert typestore().deserialize_cdr(item.raw, item.type_name).data == 'no stamp'
-
-    def test_an_unknown_topic_gives_nothing(self, write_fixes):
-        with BagReader(write_fixes(3)) as bag:
             assert list(bag.messages(['/other'])) == [] and list(bag.messages([])) == []
 
 
@@ -306,18 +298,11 @@ class TestDamage:
     @pytest.mark.parametrize(
         'name, content',
         [
-            ('no', None),
-            ('x.mcap', b''),
-            ('x.mcap', b'nonsense'),
-            ('x.db3', b'nonsense' * 100),
-            ('x.bag', b'nonsense'),
-            ('x.txt', b''),
-            ('x.mcap.zstd', b''),
-            ('dir', 'dir'),
-            ('x.mcap', b'\x89MCAP0\r\n'),
-            ('x.bag', b''),
+            ('no', None), ('x.mcap', b''), ('x.mcap', b'nonsense'), ('x.db3', b'nonsense' * 100),
+            ('x.bag', b'nonsense'), ('x.txt', b''), ('x.mcap.zstd', b''), ('dir', 'dir'),
+            ('x.mcap', b'\x89MCAP0\r\n'), ('x.bag', b''),
         ],
-    )
+    )  # fmt: skip
     def test_what_is_no_recording_is_one_sentence(self, tmp_path, name, content):
         path = tmp_path / name
         if content == 'dir':
@@ -333,20 +318,22 @@ class TestDamage:
 
 
 class TestTypes:
-    def add_custom(self, path, *, known=True, definition=True):
-        """Write /custom of a type nobody knows, and perhaps /fix, into an sqlite3 bag."""
+    def add_custom(self, path, gone=''):
+        """Write /custom of a type nobody knows, and /text, into an sqlite3 bag; gone: which
+        definitions it lacks, in SQL."""
         store = get_typestore(Stores.ROS2_JAZZY)
         store.register(get_types_from_msg('float64 value', CUSTOM))
         with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
-            link = writer.add_connection('/custom', CUSTOM, typestore=store)
-            writer.write(link, 1, store.serialize_cdr(store.types[CUSTOM](value=2.5), CUSTOM))
-            if known:
-                link = writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
-                text = store.types['std_msgs/msg/String'](data='hello')
-                writer.write(link, 2, store.serialize_cdr(text, 'std_msgs/msg/String'))
-        if not definition:
+            for log_ns, topic, kind, values in (
+                (1, '/custom', CUSTOM, {'value': 2.5}),
+                (2, '/text', 'std_msgs/msg/String', {'data': 'hello'}),
+            ):
+                link = writer.add_connection(topic, kind, typestore=store)
+                message = store.types[kind](**values)
+                writer.write(link, log_ns, store.serialize_cdr(message, kind))
+        if gone:
             with sqlite3.connect(storage_file(path)) as database:
-                database.execute('delete from message_definitions where topic_type = ?', (CUSTOM,))
+                database.execute(f'delete from message_definitions where topic_type {gone}')
             database.close()
 
     def test_a_type_defined_in_the_bag_is_read(self, tmp_path):
@@ -359,21 +346,16 @@ class TestTypes:
     )
     def test_a_known_type_needs_no_definition(self, tmp_path, gone, topics):
         """Where none is in the bag, and where only those of other types are."""
-        self.add_custom(tmp_path / 'bag')
-        with sqlite3.connect(storage_file(tmp_path / 'bag')) as database:
-            database.execute(f'delete from message_definitions where topic_type {gone}')
-        database.close()
+        self.add_custom(tmp_path / 'bag', gone)
         items, problems = read(tmp_path / 'bag')
         assert [item.topic for item in items] == topics
         assert CUSTOM in problems[0] if len(topics) == 1 else not problems
 
     def test_an_undefined_type_is_told_and_the_rest_is_read(self, tmp_path):
-        self.add_custom(tmp_path / 'bag', definition=False)
+        self.add_custom(tmp_path / 'bag', f"= '{CUSTOM}'")
         with BagReader(tmp_path / 'bag') as bag:
-            assert [(topic.name, topic.decodable) for topic in bag.topics] == [
-                ('/custom', False),
-                ('/text', True),
-            ]
+            known = [(topic.name, topic.decodable) for topic in bag.topics]
+            assert known == [('/custom', False), ('/text', True)]
             assert CUSTOM in bag.problems[0]
             assert [item.message.data for item in bag.messages(['/text'])] == ['hello']
             assert [item.topic for item in bag.messages()] == ['/text']
@@ -383,16 +365,12 @@ class TestTypes:
 @pytest.mark.parametrize(
     'place, value, sentence',
     [
-        (('topics_with_message_count', 0, 'message_count'), 'many', 'message count of many'),
-        (('topics_with_message_count', 0, 'message_count'), -5, 'message count of -5'),
-        (
-            ('topics_with_message_count', 0, 'message_count'),
-            10**20,
-            'count of 100000000000000000000',
-        ),
-        (('topics_with_message_count', 0, 'message_count'), 1e20, 'message count of 1e+20'),
-        (('topics_with_message_count', 0, 'topic_metadata', 'name'), [5], 'is no text'),
-        (('topics_with_message_count', 0, 'topic_metadata', 'name'), 5, 'is no text'),
+        ((TOPICS, 0, 'message_count'), 'many', 'message count of many'),
+        ((TOPICS, 0, 'message_count'), -5, 'message count of -5'),
+        ((TOPICS, 0, 'message_count'), 10**20, 'count of 100000000000000000000'),
+        ((TOPICS, 0, 'message_count'), 1e20, 'message count of 1e+20'),
+        ((TOPICS, 0, 'topic_metadata', 'name'), [5], 'is no text'),
+        ((TOPICS, 0, 'topic_metadata', 'name'), 5, 'is no text'),
         (('files',), 'none', 'a list of files that is none'),
         ((), '{[', ''),
     ],
@@ -413,8 +391,7 @@ def test_metadata_of_a_wrong_kind_are_told_and_the_files_are_read(
     assert sentence in problems[0]
 
 
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-@pytest.mark.parametrize('held', [0, 4])
+@pytest.mark.parametrize('storage, held', [('mcap', 0), ('mcap', 4), ('sqlite3', 4)])
 def test_an_index_that_speaks_of_more_messages_is_told(
     tmp_path, fix_message, storage, held, capsys
 ):
@@ -424,10 +401,8 @@ def test_an_index_that_speaks_of_more_messages_is_told(
         link = writer.add_connection('/fix', FIX, typestore=typestore())
         for i in range(held):
             writer.write(link, 10 + i, typestore().serialize_cdr(fix_message(i), FIX))
-    text = (path / 'metadata.yaml').read_text()
-    (path / 'metadata.yaml').write_text(
-        text.replace(f'message_count: {held}', 'message_count: 101')
-    )
+    text = (path / 'metadata.yaml').read_text().replace(f'count: {held}', 'count: 101')
+    (path / 'metadata.yaml').write_text(text)
     sentence = f'topic /fix holds {held} messages; the index of {path} says 101'
     assert sentence in read(path)[1]
     with pytest.raises(BagError, match='says 101'):

@@ -8,14 +8,24 @@
 
 """Writing recordings, and the messages of rosbags."""
 
+import csv
 import filecmp
+import io
+import sys
 
+from attrs import frozen
 import numpy as np
 import pytest
 
+from msg_adapters.estimates import read_estimate
+from sonar_imm.measurements import Fix
+from sonar_imm.truth import Received, Scene, TrueReflectors, TrueTrack, TruthTable
+from sonar_imm_tools.recordings import csv_writer, truth
+from sonar_imm_tools.recordings.csv_writer import CsvWriter, FEW_ROWS, ROWS_IN_A_BLOCK
 from sonar_imm_tools.recordings.messages import decode_cdr, ros_message, typestore
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.truth import records_of
 from sonar_imm_tools.recordings.writer import BagWriter
 
 
@@ -29,35 +39,31 @@ def test_the_same_input_gives_the_same_bytes_of_every_file(tmp_path, write_fixes
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_what_is_written_is_read(write_fixes, storage):
-    with BagReader(write_fixes(7, storage=storage, custom_data={'source': 'x.csv'})) as bag:
-        assert [(topic.name, topic.count) for topic in bag.topics] == [('/fix', 7)]
+@pytest.mark.parametrize('n', [0, 7])
+def test_what_is_written_is_read(write_fixes, n, storage):
+    with BagReader(write_fixes(n, storage=storage, custom_data={'source': 'x.csv'})) as bag:
+        assert [(topic.name, topic.count) for topic in bag.topics] == ([('/fix', n)] if n else [])
         assert bag.custom_data == {'source': 'x.csv'} and not bag.problems
-        assert [item.message.pose.pose.position.x for item in bag.messages()] == list(range(7))
+        assert [item.message.pose.pose.position.x for item in bag.messages()] == list(range(n))
 
 
 def test_a_compressed_bag_is_smaller_and_says_the_same(write_fixes):
-    plain, packed = (
-        write_fixes(200, name='plain'),
-        write_fixes(200, name='packed', compressed=True),
-    )
+    paths = [write_fixes(200, name=name, compressed=name == 'packed') for name in ('a', 'packed')]
 
     def content(path):
         with BagReader(path) as bag:
             assert not bag.problems
-            return [
-                (message.topic, message.log_ns, bytes(message.raw)) for message in bag.messages()
-            ]
+            return [(item.topic, item.log_ns, bytes(item.raw)) for item in bag.messages()]
 
-    assert content(plain) == content(packed) and len(content(plain)) == 200
-    sizes = [(path / f'{path.name}.mcap').stat().st_size for path in (plain, packed)]
+    plain, packed = map(content, paths)
+    assert plain == packed and len(plain) == 200
+    sizes = [(path / f'{path.name}.mcap').stat().st_size for path in paths]
     assert sizes[1] < 0.6 * sizes[0]
 
 
 def test_the_metadata_are_of_version_8_with_the_offered_qos(write_fixes):
     path = write_fixes(1)
-    text = (path / 'metadata.yaml').read_text()
-    assert 'version: 8' in text
+    assert 'version: 8' in (path / 'metadata.yaml').read_text()
     with BagReader(path) as bag:
         (profile,) = bag.topics[0].offered_qos
         assert profile.reliability.name == 'RELIABLE' and profile.depth == 10
@@ -90,13 +96,6 @@ def test_an_existing_target_is_left_alone(write_fixes, tmp_path):
         BagWriter(tmp_path / 'file' / 'bag')
 
 
-def test_an_empty_bag_is_a_bag(tmp_path):
-    with BagWriter(tmp_path / 'bag'):
-        pass
-    with BagReader(tmp_path / 'bag') as bag:
-        assert bag.topics == [] and list(bag.messages()) == [] and not bag.problems
-
-
 def test_programming_errors_are_told(tmp_path, fix_message):
     with pytest.raises(ValueError, match='mcap, sqlite3'):
         BagWriter(tmp_path / 'bag', storage='zip')
@@ -123,9 +122,6 @@ def test_fields_are_cast_strictly():
     assert cloud.data.tolist() == [1, 2] and type(cloud.height) is int
     pose = ros_message('geometry_msgs/msg/PoseWithCovariance', covariance=np.eye(6))
     assert pose.covariance.shape == (36,)
-
-
-def test_an_unknown_field_is_named():
     with pytest.raises(TypeError, match='sek'):
         ros_message('builtin_interfaces/msg/Time', sek=1)
 
@@ -139,3 +135,144 @@ def test_spare_alignment_bytes_are_no_damage_but_damage_is():
         decode_cdr(typestore(), name, raw + bytes(100))
     with pytest.raises(Exception, match='JointState'):
         decode_cdr(typestore(), name, raw[:20])
+
+
+# -- tables of numbers as CSV: the same bytes whatever writes them
+
+
+RNG = np.random.default_rng(3)
+POWERS = 10.0 ** np.arange(-320, 309)
+NEAR = [np.nextafter(POWERS, way) for way in (-np.inf, np.inf)]
+SPREAD = np.exp(RNG.uniform(-40.0, 45.0, 50_000)) * RNG.choice([-1.0, 1.0], 50_000)
+HOSTILE = {
+    'any bits': RNG.integers(0, 2**64, 50_000, dtype=np.uint64).view(np.float64),
+    'powers of ten': np.concatenate([POWERS, -POWERS, *NEAR, POWERS / 3.0, -1.25 * POWERS]),
+    'spread': SPREAD,
+    'rounded': np.round(SPREAD, 6),
+    'float32': SPREAD.astype(np.float32),
+    'whole': RNG.integers(-(10**17), 10**17, 5000).astype(float),
+    'no numbers': np.tile([0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 1e-5, 1e16], 200),
+    'int64': RNG.integers(-(2**63), 2**63 - 1, 2000),
+    'uint8': RNG.integers(0, 256, 2000).astype(np.uint8),
+    'flags': RNG.random(2000) < 0.5,
+}
+
+
+def written(columns):
+    file = io.StringIO()
+    CsvWriter(file).write_columns(columns)
+    return file.getvalue()
+
+
+def plain(columns):
+    file = io.StringIO()
+    rows = zip(*(column.tolist() for column in columns))
+    csv.writer(file, lineterminator='\n').writerows(rows)
+    return file.getvalue()
+
+
+@pytest.fixture
+def without_pyarrow(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'pyarrow', None)
+    csv_writer._arrow.cache_clear()
+    yield
+    csv_writer._arrow.cache_clear()
+
+
+@pytest.mark.filterwarnings('ignore:overflow encountered')
+@pytest.mark.parametrize('name', HOSTILE)
+def test_numbers_have_the_digits_of_python(name):
+    column = HOSTILE[name]
+    assert len(column) >= FEW_ROWS
+    assert written([column, column[::-1]]) == plain([column, column[::-1]])
+
+
+@pytest.mark.parametrize('rows', [0, 1, FEW_ROWS - 1, ROWS_IN_A_BLOCK, ROWS_IN_A_BLOCK + 1])
+def test_blocks_follow_one_another(rows):
+    columns = [np.arange(rows), SPREAD[:rows]]
+    assert written(columns) == plain(columns)
+
+
+def test_pyarrow_writes_them_where_it_is_there():
+    pytest.importorskip('pyarrow')
+    assert csv_writer._arrow() is not None
+
+
+def test_the_same_bytes_without_pyarrow(without_pyarrow):
+    assert csv_writer._arrow() is None
+    assert written([SPREAD, SPREAD]) == plain([SPREAD, SPREAD])
+
+
+def test_a_pyarrow_with_other_digits_is_not_used(monkeypatch):
+    pytest.importorskip('pyarrow')
+    monkeypatch.setattr(
+        csv_writer, '_texts', lambda column, arrow: arrow.array(['1'] * len(column))
+    )
+    csv_writer._arrow.cache_clear()
+    assert csv_writer._arrow() is None
+    assert written([SPREAD]) == plain([SPREAD])
+    csv_writer._arrow.cache_clear()
+
+
+# -- scenes become bags: each class by its own writer, in the order of reception
+
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def fix(offset_ns):
+    return Fix(stamp_ns=START_NS + offset_ns, position=(1.0, 2.0, 0.0), frame_id='map')
+
+
+def logged(path):
+    with BagReader(path) as bag:
+        return [(item.topic, item.log_ns - START_NS) for item in bag.messages()]
+
+
+def test_late_measurements_are_recorded_when_they_were_received(tmp_path):
+    scene = Scene(
+        (Received(START_NS + 9, fix(1)), Received(START_NS + 4, fix(3))),
+        (TrueTrack(7, START_NS + np.array([2, 6]), np.zeros((2, 3)), np.ones((2, 2))),),
+    )
+    report = truth.write_scene(scene, tmp_path / 'bag', provenance={})
+    assert report.messages == {'/fix': 2, '/truth/estimate': 2}
+    truth = '/truth/estimate'
+    assert logged(tmp_path / 'bag') == [(truth, 2), ('/fix', 4), (truth, 6), ('/fix', 9)]
+
+
+def test_a_scene_may_know_other_truth_of_its_own(tmp_path):
+    @frozen
+    class Buoy:
+        stamp_ns: int
+
+        def tables(self, frame_id):
+            yield TruthTable(self.stamp_ns, frame_id, {'x': np.zeros(1, np.float32)}, 'north')
+
+    scene = Scene((Received(START_NS + 1, fix(0), 'south'),), (Buoy(START_NS + 2),))
+    truth.write_scene(scene, tmp_path / 'bag', provenance={})
+    assert logged(tmp_path / 'bag') == [('/south/fix', 1), ('/truth/north/estimate', 2)]
+
+
+def test_a_true_track_is_a_table_at_each_stamp():
+    places, speeds = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], [[0.1, 0.2], [np.nan, np.nan]]
+    true = TrueTrack(9, np.array([5, 8]), np.array(places), np.array(speeds))
+    first, second = records_of(true, 'map')
+    assert first[:2] == (5, '/truth/estimate') and second[:2] == (8, '/truth/estimate')
+    names = 'x y z px py vx vy track_id'.split()
+    assert [field.name for field in first[2].fields] == names
+    truth = read_estimate(second[2])
+    assert truth.frame_id == 'map' and truth.stamp_ns == 8
+    assert truth.xyz.tolist() == [[4.0, 5.0, 6.0]]
+    assert truth.extras['py'].tolist() == [5.0] and truth.extras['track_id'].tolist() == [9]
+    assert read_estimate(first[2]).extras['vx'].tolist() == [0.1]
+    assert np.isnan(truth.extras['vx']).all()
+
+
+def test_true_reflectors_lie_below_and_may_be_none():
+    true = TrueReflectors(5, 'array', np.array([3, 4]), np.array([10.0, 20.5]), np.ones(2))
+    (record,) = records_of(true, 'elsewhere')
+    truth = read_estimate(record[2])
+    assert truth.frame_id == 'array' and truth.xyz[:, 2].tolist() == [-10.0, -20.5]
+    assert truth.extras['depth'].tolist() == [10.0, 20.5]
+    nothing = TrueReflectors(5, 'array', np.empty(0, int), np.empty(0), np.empty(0))
+    assert len(read_estimate(records_of(nothing, '')[0][2])) == 0

@@ -19,6 +19,7 @@ from ..model_checks import matrix_problems
 from ..shared_parameters import StampParameters
 
 PULSES = ('auto', 'band', 'processor', 'envelope', 'gaussian', 'file')
+PULSE_WIDTHS = 1e-4, 100.0
 POLARITIES = ('auto', 'positive', 'both')
 MULTIPLES = ('mark', 'off')
 PHONE_CORRECTIONS = ('off', 'gains', 'full')
@@ -130,7 +131,7 @@ class FathometerConfig(StampParameters):
         'arrays longer than an eighth of the longest wave, else band, or gaussian where traces '
         'have another width', choices=PULSES)
     pulse_width: float = parameter(0.5, 'm',
-        'pulse gaussian: standard deviation of the pulse', range=(1e-4, 100.0))
+        'pulse gaussian: standard deviation of the pulse', range=PULSE_WIDTHS)
     pulse_file: str = parameter('', '',
         'pulse file: CSV of distance in m from 0 on, and value')
 

@@ -75,7 +75,8 @@ def mirror_sigma(
     if not beyond:
         first = int(np.argmax(quiet))
         near = _own_sound(noise[quiet], whole, max(LEAST_NOISE_SAMPLES, int(aperture / step)))
-        sigma[first : first + len(near)] = near[: len(below) - first]
+        near = near[: max(len(below) - first, 0)]
+        sigma[first : first + len(near)] = near
     return sigma
 
 

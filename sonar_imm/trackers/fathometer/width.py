@@ -26,7 +26,7 @@ from ...acoustics.fathometer import noise_sigma
 from ...acoustics.pulse import Pulse
 from ...estimation.arrays import FloatArray
 from ...measurements import Trace
-from .config import FathometerConfig
+from .config import FathometerConfig, PULSE_WIDTHS
 from .noise import stated_sigma
 
 LOOKS = 1, 5, 15, 60
@@ -72,6 +72,8 @@ class EchoWidth:
         due = float(lag[below[0]]) if len(below) else math.inf
         fits = due / TIMES < half < due * TIMES or max(half, due) < least
         width = 0.0 if fits else max(half, least) / HALF
+        if width and not PULSE_WIDTHS[0] <= width <= PULSE_WIDTHS[1]:
+            return False
         if abs(width - self.followed) <= CLOSE * self.followed:
             return False
         self.followed = width
@@ -93,7 +95,8 @@ class EchoWidth:
     def require(self) -> None:
         """Raise ValueError where the state, which may come from a file, is impossible."""
         good = np.isfinite(self._seen).all() and len(self._seen) <= LOOKS[-1]
-        if not (good and 0.0 <= self.followed < math.inf and 0.0 <= self.separation < math.inf):
+        known = self.followed == 0.0 or PULSE_WIDTHS[0] <= self.followed <= PULSE_WIDTHS[1]
+        if not (good and known and 0.0 <= self.separation <= APART * PULSE_WIDTHS[1]):
             raise ValueError('no echo is as wide as that')
 
 

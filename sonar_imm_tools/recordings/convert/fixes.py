@@ -199,6 +199,7 @@ def _ask_for_vessel(table: Table) -> None:
 _OF_RANGES = (
     'stamp', 'date', 'fraction', 'range', 'bearing', 'std_range', 'std_bearing', 'z', 'depth',
     'height', 'var_z', 'std_z', 'std_depth', 'var_depth', 'std', 'id', 'valid', 'status',
+    'quality',
 )  # fmt: skip
 """Quantities of a table of ranges and bearings from one place."""
 

@@ -12,6 +12,7 @@ from attrs import evolve
 import numpy as np
 import pytest
 
+from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm_tools.evaluation.bathymetry import figures, METRICS, summary_sentence
 from sonar_imm_tools.evaluation.bathymetry.figures import (
@@ -20,7 +21,16 @@ from sonar_imm_tools.evaluation.bathymetry.figures import (
     profile_figure,
     verdict_figure,
 )
-from sonar_imm_tools.evaluation.bathymetry.scoring import Profile, runs, score, Swath, TrueFloor
+from sonar_imm_tools.evaluation.bathymetry.scoring import (
+    Profile,
+    profile_of,
+    profiles_of,
+    rough_models,
+    runs,
+    score,
+    Swath,
+    TrueFloor,
+)
 from sonar_imm_tools.evaluation.numbers import cards, lines
 from sonar_imm_tools.survey.chart import Chart
 
@@ -40,16 +50,11 @@ def profile(
     echo[shadow] = False
     truth = TrueFloor(np.zeros(N), np.full(N, 0.1), patch, echo)
     return Profile(
-        stamp_ns=stamp_ns,
-        range=20.0 + np.arange(N),
-        height=np.full(N, height),
-        height_std=np.full(N, 0.06),
-        angle=np.full(N, 0.1 + np.radians(2.0)),
-        angle_std=np.full(N, 0.01),
-        valid=np.ones(N, bool) if valid is None else valid,
-        probabilities=probabilities,
-        truth=truth if known else None,
-    )
+        stamp_ns=stamp_ns, range=20.0 + np.arange(N), height=np.full(N, height),
+        height_std=np.full(N, 0.06), angle=np.full(N, 0.1 + np.radians(2.0)),
+        angle_std=np.full(N, 0.01), valid=np.ones(N, bool) if valid is None else valid,
+        probabilities=probabilities, truth=truth if known else None,
+    )  # fmt: skip
 
 
 def swath(*profiles, names=('rw_smooth', 'rw_rough')):
@@ -94,9 +99,8 @@ def test_errors_by_place_and_the_share_inside_the_band():
     assert metrics['height']['all']['n'] == N
     assert metrics['height']['all']['rmse_m'] == pytest.approx(np.sqrt((14 * 0.01 + 6 * 0.09) / N))
     assert metrics['angle']['all']['rmse_deg'] == pytest.approx(2.0)
-    assert metrics['inside_band'] == pytest.approx(
-        {'smooth': 1.0, 'patch': 0.0, 'all': 0.7, 'shadow': np.nan}, nan_ok=True
-    )
+    inside = {'smooth': 1.0, 'patch': 0.0, 'all': 0.7, 'shadow': np.nan}
+    assert metrics['inside_band'] == pytest.approx(inside, nan_ok=True)
 
 
 @pytest.mark.parametrize('patch, both', [(PATCH, True), (slice(0, N), False), (slice(0), False)])
@@ -127,12 +131,9 @@ def test_what_is_called_smooth_and_rough_and_how_much_of_it_is():
     verdict[:4], verdict[8:10], verdict[12:16] = 0, 0, 1
     called = evolve(profile(), verdict=verdict)
     metrics = score(swath(called))
-    assert metrics['verdicts'] == pytest.approx(
-        {
-            'smooth': 0.3, 'rough': 0.2, 'cannot_tell': 0.5, 'smooth_right': 4 / 6,
-            'rough_right': 0.5,
-        }
-    )  # fmt: skip
+    shares = {'smooth': 0.3, 'rough': 0.2, 'cannot_tell': 0.5}
+    right = {'smooth_right': 4 / 6, 'rough_right': 0.5}
+    assert metrics['verdicts'] == pytest.approx(shares | right)
     assert dict(lines(METRICS, metrics))['of these right, smooth / rough'] == '66.7 % / 50.0 %'
     unknown = score(swath(evolve(called, truth=None)))
     assert set(unknown['verdicts']) == {'smooth', 'rough', 'cannot_tell'}
@@ -186,21 +187,89 @@ def test_both_heights_are_compared_with_the_nearest_surface():
     unsure = np.zeros(N, bool)
     unsure[15] = True
     upper = np.where(two, 2.6, np.nan), np.where(two, 0.15, np.nan)
-    item = evolve(
-        profile(valid=~unsure), truth=truth, height=height, two=two, upper=upper, unsure=unsure
-    )
+    given = {'truth': truth, 'height': height, 'two': two, 'upper': upper, 'unsure': unsure}
+    item = evolve(profile(valid=~unsure), **given)
     metrics = score(swath(item))
     scores = metrics['layover']
     assert (scores['bins'], scores['found'], scores['lost']) == (4, 1.0, 0.0)
     assert scores['heights']['n'] == 8
     assert scores['heights']['rmse_m'] == pytest.approx(np.sqrt((0.2**2 + 0.4**2) / 2.0))
     assert scores['heights']['inside_band'] == 0.0
-    assert metrics['height']['all']['rmse_m'] == pytest.approx(
-        np.sqrt((4 * 0.2**2 + 16 * 0.1**2) / N)
-    )
+    every = np.sqrt((4 * 0.2**2 + 16 * 0.1**2) / N)
+    assert metrics['height']['all']['rmse_m'] == pytest.approx(every)
     assert metrics['heard_share'] == 1.0
     words = dict(lines(METRICS, metrics))
     assert words['two surfaces: found / single bins taken for two'] == '100 % / 0.0 %'
     names = [trace.name for trace in profile_figure(item).data]
     assert 'upper surface' in names and 'truth, second surface' in names
     assert 'one surface or two: no sounding' in names
+
+
+# -- estimate and truth side by side --------------------------------------------------------------
+
+RANGES = np.array([20.0, 20.5, 21.0, 21.5])
+
+
+def estimate(state='height', *, stamp_ns=7, ranges=RANGES):
+    n = len(ranges)
+    other = 'angle' if state == 'height' else 'height'
+    return Estimate(
+        stamp_ns=stamp_ns, frame_id='sonar', xyz=np.tile([0.0, -8.0, -15.0], (n, 1)),
+        state_names=(state,), state=np.full((n, 1), 0.25), covariance=np.full((n, 1, 1), 0.04),
+        model_names=('rw_smooth', 'rw_rough'), probabilities=np.tile([0.9, 0.1], (n, 1)),
+        extras={'range': ranges, other: np.full(n, 0.5), 'valid': np.array([1, 1, 0, 1][:n])},
+    )  # fmt: skip
+
+
+def truth(ranges, *, stamp_ns=7):
+    n = len(ranges)
+    values = {
+        'range': ranges, 'height': np.arange(n) * 1.0, 'angle': np.arange(n) * 0.1,
+        'patch': np.arange(n) % 2, 'valid': np.ones(n, np.uint8),
+    }  # fmt: skip
+    return Estimate(
+        stamp_ns=stamp_ns, frame_id='sonar', xyz=np.zeros((n, 3)), state_names=(),
+        state=np.empty((n, 0)), covariance=np.empty((n, 0, 0)), extras=values,
+    )  # fmt: skip
+
+
+def test_the_standard_deviation_of_what_is_no_state_follows_from_the_arm():
+    profile = profile_of(estimate('height'), None)
+    np.testing.assert_allclose(profile.height_std, 0.2)
+    np.testing.assert_allclose(profile.angle_std, 0.2 / 8.0)
+    profile = profile_of(estimate('angle'), None)
+    np.testing.assert_allclose(profile.angle_std, 0.2)
+    np.testing.assert_allclose(profile.height_std, 0.2 * 8.0)
+    np.testing.assert_allclose(profile.height, 0.5)
+    assert profile.valid.tolist() == [True, True, False, True]
+    assert profile.truth is None
+
+
+def test_truth_of_other_bins_is_taken_from_the_nearest_or_unknown():
+    floor = profile_of(estimate(), truth(np.array([19.0, 20.25, 20.9, 30.0]))).truth
+    np.testing.assert_array_equal(floor.height, [1.0, 1.0, 2.0, np.nan])
+    assert floor.patch.tolist() == [True, True, False, False]
+    assert floor.echo.tolist() == [True, True, True, False]
+
+
+def test_truth_and_pings_with_hardly_a_bin():
+    for ranges in (np.empty(0), np.array([20.5])):
+        floor = profile_of(estimate(), truth(ranges)).truth
+        assert np.isfinite(floor.height).sum() == len(ranges)
+    floor = profile_of(estimate(ranges=RANGES[:1]), truth(np.array([19.0, 30.0]))).truth
+    assert floor.height.tolist() == [0.0]
+
+
+def test_pings_meet_the_truth_of_their_own_stamp():
+    swath = profiles_of([estimate(stamp_ns=7), estimate(stamp_ns=8)], [truth(RANGES, stamp_ns=8)])
+    assert [profile.truth is None for profile in swath.profiles] == [True, False]
+    assert swath.model_names == ('rw_smooth', 'rw_rough')
+    np.testing.assert_allclose(swath.roughness(swath.profiles[0]), 0.1)
+
+
+def test_which_models_are_rough():
+    assert rough_models(('rw', 'ncs')).tolist() == [True, False]
+    assert rough_models(('rw_smooth', 'rw_rough')).tolist() == [False, True]
+    assert rough_models(('steady', 'winding', 'walk')).tolist() == [False, False, True]
+    assert rough_models(('rw_smooth',)).tolist() == [False]
+    assert rough_models(()).tolist() == []

@@ -10,12 +10,25 @@
 
 import json
 
+from attrs import evolve
 import numpy as np
 import pytest
 
+from msg_adapters.array_records import write_trace
 from sonar_imm.measurements import Trace
+from sonar_imm.trackers.fathometer.config import FathometerConfig
+from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.fathometer import LIMIT
+from sonar_imm_tools.evaluation.fathometer.crossing import (
+    common_shift,
+    compared,
+    crossing_lines,
+    crossing_metrics,
+    Horizon,
+    mistie_figure,
+    summary,
+)
 from sonar_imm_tools.evaluation.fathometer.figures import (
     Image,
     MOST_DEPTHS,
@@ -23,6 +36,7 @@ from sonar_imm_tools.evaluation.fathometer.figures import (
     response_figure,
     response_image,
 )
+from sonar_imm_tools.evaluation.fathometer.predictive import for_tuning, Scored, tunables
 from sonar_imm_tools.evaluation.fathometer.scoring import (
     pair,
     Record,
@@ -32,18 +46,20 @@ from sonar_imm_tools.evaluation.fathometer.scoring import (
 )
 from sonar_imm_tools.evaluation.judging import judge
 from sonar_imm_tools.offline.run_folder import read_measurements, RunFolder
+from sonar_imm_tools.recordings.conversion import ConversionReport, write_bag
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.own_files import write_own_parameters
+from sonar_imm_tools.recordings.positions import write_position
 from sonar_imm_tools.recordings.sources import BagError
 
 SECOND = 10**9
 
 
 def reflections(depth, strength=None, track_id=None):
-    depth = np.array(depth, float)
-    return Reflections(
-        depth,
-        np.ones(len(depth)) if strength is None else np.array(strength, float),
-        np.arange(len(depth)) if track_id is None else np.array(track_id),
-    )
+    n = len(depth)
+    strength = np.array(np.ones(n) if strength is None else strength, float)
+    track_id = np.array(np.arange(n) if track_id is None else track_id)
+    return Reflections(np.array(depth, float), strength, track_id)
 
 
 def record(found, true, stamp=1, order=None, **extra):
@@ -56,13 +72,9 @@ def record(found, true, stamp=1, order=None, **extra):
     )  # fmt: skip
 
 
-def test_a_set_lies_no_distance_from_itself():
-    z = np.array([130.0, 134.0, 138.0])
-    assert pair(z, z[::-1], 2.0).ospa == 0.0
-    assert pair(z[:0], z[:0], 2.0).ospa == 0.0
-
-
 def test_ospa_in_closed_form():
+    z = np.array([130.0, 134.0, 138.0])
+    assert pair(z, z[::-1], 2.0).ospa == pair(z[:0], z[:0], 2.0).ospa == 0.0
     assert pair(np.array([10.0]), np.array([10.3]), 2.0).ospa == pytest.approx(0.3)
     assert pair(np.array([10.0]), np.array([15.0]), 2.0).ospa == pytest.approx(2.0)
     assert pair(np.array([]), np.array([15.0, 16.0]), 2.0).ospa == pytest.approx(2.0)
@@ -117,12 +129,8 @@ def test_a_whole_run_is_judged_and_told(run, capsys):
     assert judgement.accuracy(None).good and not judgement.accuracy(1e-6).good
     assert judgement.accuracy(None).name == f'{LIMIT.meaning} against truth'
     titles = [section.title for section in judgement.part([]).sections]
-    assert titles[:4] == [
-        'Depth response and reflectors',
-        'How many there are',
-        'Amplitudes',
-        'Distance from the truth',
-    ]
+    first = ['Depth response and reflectors', 'How many there are']
+    assert titles[:4] == [*first, 'Amplitudes', 'Distance from the truth']
     assert main(['evaluate', str(run.path), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['ospa_m'] == judgement.metrics['ospa_m']
 
@@ -158,13 +166,11 @@ def test_without_truth_there_is_a_page_and_no_verdict(run):
 
 
 def test_other_estimates_and_other_truth_are_one_sentence(run):
-    import attrs
-
     some = run.read_estimates()
-    bare = [attrs.evolve(item, extras={}) for item in some]
+    bare = [evolve(item, extras={}) for item in some]
     with pytest.raises(BagError, match='not estimates of reflectors'):
         records_of(bare)
-    divers = [attrs.evolve(item, state_names=('px', 'py')) for item in some]
+    divers = [evolve(item, state_names=('px', 'py')) for item in some]
     with pytest.raises(BagError, match='truth is not that of reflectors'):
         records_of(some, divers)
 
@@ -183,3 +189,221 @@ def test_the_truth_of_a_record_is_that_of_its_lag_later(run):
     assert shifted[-1].true is None
     for record, depth in zip(shifted[:-1], there[1:], strict=True):
         np.testing.assert_array_equal(np.sort(record.true.depth), depth)
+
+
+# -- two simulated lines over one floor, which they see along different courses -------------------
+
+LON, LAT, METRE = -91.64, 17.13, 180.0 / (np.pi * 6_371_008.8)
+DEPTH = 0.25 * np.arange(140)
+
+
+def floor(east, north):
+    """Depths of two layers there: the lower one slopes to the north."""
+    return 12.0 + 0.01 * east, 20.0 + 0.05 * north
+
+
+def line(folder, name, places, shift=0.0, positions=True, first=0, lower=None):
+    """A tracked line past `places` (T, 2) m, of traces that are too deep by `shift` and begin with
+    sample `first`; lower: which of the places see the lower layer."""
+    rng, records = np.random.default_rng(len(name)), []
+    for k, (east, north) in enumerate(places):
+        stamp = (1000 + k) * SECOND
+        echo = 0.01 * np.abs(rng.standard_normal(len(DEPTH)))
+        for depth in floor(east, north)[: 1 if lower is not None and k not in lower else 2]:
+            echo += np.exp(-0.5 * np.square((DEPTH - depth - shift) / 0.5))
+        trace = Trace(
+            stamp_ns=stamp, depth=DEPTH[first:], amplitude=echo[first:], reference_depth=0.0
+        )
+        if positions:
+            place = LON + east * METRE / np.cos(np.radians(LAT)), LAT + north * METRE
+            records.append((stamp, '/position', write_position(stamp, *place)))
+        records.append((stamp, '/trace', write_trace(trace, ros_message)))
+    bag = folder / f'{name}.bag'
+    write_bag(bag, records, ConversionReport(bag), source=name)
+    own = {**envelope_parameters(0.5, 0.05), 'particles': 400, 'depth_std': 0.1}
+    write_own_parameters(bag, {'fathometer': own})
+    assert main(['track', str(bag), str(folder / name)]) == 0
+    return folder / name
+
+
+@pytest.fixture(scope='module')
+def lines(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('lines')
+    way = np.linspace(-40.0, 40.0, 41)
+    north = np.column_stack([np.full(41, -8.0), way])
+    return {
+        'we': line(folder, 'we', np.column_stack([way, np.full(41, 5.0)])),
+        'sn': line(folder, 'sn', north),
+        'deep': line(folder, 'deep', north, shift=0.6),
+        'cut': line(folder, 'cut', north, first=48),
+        'late': line(folder, 'late', north, lower=range(27, 41)),
+        'far': line(folder, 'far', np.column_stack([np.full(8, 90.0), way[:8]])),
+        'lost': line(folder, 'lost', np.column_stack([way, way])[:8], positions=False),
+    }
+
+
+def crossed(lines, a, b, position_std=3.0):
+    return crossing_metrics(RunFolder(lines[a]), RunFolder(lines[b]), position_std)
+
+
+def test_where_lines_cross_their_horizons_agree(lines):
+    metrics = crossed(lines, 'we', 'sn')
+    [crossing] = metrics['crossings']
+    there = LON - 8.0 * METRE / np.cos(np.radians(LAT)), LAT + 5.0 * METRE
+    assert (crossing['longitude'], crossing['latitude']) == pytest.approx(there, abs=1e-7)
+    assert crossing['angle_deg'] == pytest.approx(90.0, abs=0.1)
+    assert crossing['stamp_a_ns'] == 1016 * SECOND and crossing['stamp_b_ns'] == 1022 * SECOND
+    assert crossing['only_a'] == crossing['only_b'] == 0
+    for horizon, true in zip(crossing['horizons'], floor(-8.0, 5.0)):
+        assert horizon['depth_a_m'] == pytest.approx(true, abs=0.25)
+        assert abs(horizon['difference_m']) < 0.3 and abs(horizon['sigmas']) < 2.5
+    assert [horizon['bottom'] for horizon in crossing['horizons']] == [True, False]
+
+
+def test_misties_are_drawn_by_horizon(lines, tmp_path):
+    metrics = crossed(lines, 'we', 'sn')
+    horizons = metrics['crossings'][0]['horizons']
+    [drawn] = mistie_figure(metrics).data
+    assert list(drawn.x) == [horizon['difference_m'] for horizon in horizons]
+    assert list(drawn.error_x.array) == [2.0 * horizon['std_m'] for horizon in horizons]
+    assert drawn.y[0].startswith('floor') and drawn.marker.symbol == 'circle'
+    cut = mistie_figure(crossed(lines, 'we', 'cut')).data
+    assert [each.marker.symbol for each in cut] == ['circle-open']
+    page = tmp_path / 'misties.html'
+    runs = [str(lines[name]) for name in ('we', 'sn')]
+    assert main(['evaluate', *runs, '--crossing', '--report', str(page)]) == 0
+    assert 'with two standard deviations' in page.read_text()
+
+
+def test_the_error_of_a_position_counts_by_the_slope(lines):
+    without, with_it = (crossed(lines, 'we', 'sn', std)['crossings'][0] for std in (0.0, 20.0))
+    level, steep = (
+        np.sqrt(b['std_m'] ** 2 - a['std_m'] ** 2)
+        for a, b in zip(without['horizons'], with_it['horizons'])
+    )
+    # The lower layer slopes by 0.05 to the north, the upper one by 0.01 to the east, whatever line
+    # sees it; the place of either line can be wrong.
+    assert steep == pytest.approx(np.sqrt(2.0) * 20.0 * 0.05, abs=0.3) and level < 0.5
+
+
+def test_a_line_that_is_too_deep_shows(lines):
+    metrics = crossed(lines, 'we', 'deep')
+    for horizon in metrics['crossings'][0]['horizons']:
+        assert horizon['difference_m'] == pytest.approx(-0.6, abs=0.3)
+    assert metrics['rms_sigmas'] > 2.0
+    # All of it is common to both horizons.
+    assert metrics['crossings'][0]['shift_m'] == pytest.approx(-0.6, abs=0.15)
+    assert metrics['crossings'][0]['residual_rms_m'] < 0.25
+    assert metrics['between_lines_m'] == pytest.approx(0.6, abs=0.2)
+    assert 'more than is stated' in crossing_lines(metrics)[-1]
+    agreeing = crossed(lines, 'we', 'sn')
+    assert agreeing['between_lines_m'] == 0.0
+    assert 'more than is stated' not in crossing_lines(agreeing)[-1]
+
+
+def test_below_a_floor_that_is_cut_nothing_is_judged(lines, capsys):
+    """The traces of one line begin at 12 m, below the floor there: what they show at their first
+    depth is no depth of the floor."""
+    metrics = crossed(lines, 'we', 'cut')
+    [crossing] = metrics['crossings']
+    assert crossing['floor_cut'] and len(crossing['horizons']) == 2
+    assert [h['cut'] for h in crossing['horizons']] == [True, False]
+    assert not any(h['judged'] for h in crossing['horizons'])
+    assert metrics['matched'] == 2 and metrics['judged'] == 0
+    assert np.isnan(metrics['rms_sigmas']) and 'shift_m' not in crossing
+    assert main(['evaluate', str(lines['we']), str(lines['cut']), '--crossing']) == 0
+    output = capsys.readouterr().out
+    assert 'bottom, cut' in output and 'not judged' in output
+
+
+def test_what_was_not_seen_at_the_crossing_is_not_compared(lines):
+    """This line has the lower layer from 9 m beyond the crossing on."""
+    [crossing] = crossed(lines, 'we', 'late')['crossings']
+    assert [h['bottom'] for h in crossing['horizons']] == [True]
+    # Where places may be wrong by so much it is.
+    assert len(crossed(lines, 'we', 'late', 10.0)['crossings'][0]['horizons']) == 2
+
+
+@pytest.mark.parametrize('first, second, bottom', [(0.6, 0.9, True), (0.9, 0.5, False)])
+def test_a_pair_is_the_floor_where_both_lines_rather_take_it_for_it(first, second, bottom):
+    first, other = (
+        Horizon(1, 20.0, 0.1, 0.0, is_bottom=share, multiple=0.0, cut=False)
+        for share in (first, second)
+    )
+    for both in ([first], [other]), ([other], [first]):
+        [horizon] = compared(*both, 1.0, np.eye(2), 0.0)['horizons']
+        assert horizon['bottom'] == bottom
+    # Of those a separation apart nobody knows that they are one.
+    further = first._replace(depth=21.0)
+    assert compared([first], [further], 1.0, np.eye(2), 0.0)['horizons'] == []
+
+
+def test_shift_and_spread_of_differences_that_are_known():
+    """Many made-up crossings: what comes out has the mean and the variances that went in."""
+    rng = np.random.default_rng(3)
+    shifts, chi2, everything = [], [], []
+    std = np.array([0.1, 0.2, 0.3, 0.4])
+    for _ in range(2000):
+        off = 0.5 + std * rng.standard_normal(4)
+        rows = [{'difference_m': d, 'std_m': s, 'sigmas': d / s} for d, s in zip(off, std)]
+        shift = common_shift(rows)
+        shifts.append((shift['shift_m'] - 0.5) / shift['shift_std_m'])
+        chi2.append(shift['residual_rms_sigmas'] ** 2)
+        everything += rows
+    assert np.mean(shifts) == pytest.approx(0.0, abs=0.08)
+    assert np.std(shifts) == pytest.approx(1.0, abs=0.06)
+    assert np.mean(chi2) == pytest.approx(1.0, abs=0.07)
+    assert summary(everything)['between_lines_m'] == pytest.approx(0.5, abs=0.02)
+    assert common_shift(rows[:1]) == {} and summary([])['judged'] == 0
+
+
+def test_the_command_says_it_and_what_is_missing(lines, capsys):
+    assert main(['evaluate', str(lines['we']), str(lines['sn']), '--crossing']) == 0
+    out = capsys.readouterr().out
+    assert '2 horizons matched' in out and ', bottom' in out and 'stated sigma' in out
+    assert main(['evaluate', str(lines['we']), str(lines['sn']), '--crossing', '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['matched'] == 2
+    assert crossed(lines, 'we', 'far')['crossings'] == []
+    with pytest.raises(BagError, match='has no positions'):
+        crossed(lines, 'we', 'lost')
+    assert main(['evaluate', str(lines['we']), str(lines['far']), '--crossing']) == 0
+    assert 'do not cross' in capsys.readouterr().out
+    assert main(['evaluate', str(lines['we']), '--crossing']) == 2
+    assert main(['evaluate', str(lines['we']), str(lines['sn'])]) == 2
+
+
+# -- what of the fathometer is tuned --------------------------------------------------------------
+
+
+def names(sigma=None, **values):
+    trace = Trace(stamp_ns=1, depth=np.arange(3.0), amplitude=np.ones(3), sigma=sigma)
+    return [found.name for found in tunables(FathometerConfig(**values), [trace])]
+
+
+ALWAYS = ['depth_std', 'amplitude_std_sigmas']
+
+
+def test_what_is_tuned_of_pulses_and_of_noise_that_is_not_stated():
+    assert names(np.ones(3), pulse='gaussian') == [*ALWAYS, 'pulse_width']
+    assert names(np.ones(3), pulse='auto') == ALWAYS
+    assert names(noise_sigma=0.5, pulse='auto') == ['noise_sigma', *ALWAYS]
+
+
+def total(depth_std, stated=0.3):
+    """Log evidence of five traces of noise alone, of 0.3."""
+    rng, depth = np.random.default_rng(4), np.arange(100.0, 160.0, 0.1)
+    amplitudes, sigma = 0.3 * rng.normal(size=(5, len(depth))), np.full(len(depth), stated)
+    traces = [
+        Trace(stamp_ns=(k + 1) * SECOND, depth=depth, amplitude=each, sigma=sigma)
+        for k, each in enumerate(amplitudes)
+    ]
+    tracker = Scored(for_tuning(FathometerConfig(depth_std=depth_std, particles=500)), traces)
+    for trace in traces:
+        tracker.process(trace)
+    return sum(score for score, _ in tracker.scores.values())
+
+
+def test_depths_between_the_samples_of_a_trace_are_no_data_and_noise_is_what_it_is():
+    """A small `depth_std` needs a finer grid: noise alone stays as probable as it was."""
+    assert total(0.01) == pytest.approx(total(0.2), abs=15.0)
+    assert total(0.2) > max(total(0.2, 0.25), total(0.2, 0.36))

@@ -18,12 +18,18 @@ from scipy.special import ndtr
 
 from sonar_imm.estimates import Estimate, places
 from sonar_imm.measurements import Altitude, Detections, Navigation
-from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
 from sonar_imm_tools.evaluation.obstacle.figures import error_figure, image_figure, map_section
-from sonar_imm_tools.evaluation.obstacle.scoring import score, tether_length
-from sonar_imm_tools.evaluation.obstacle.series import series_of, TruePath, truth_of
+from sonar_imm_tools.evaluation.obstacle.scoring import (
+    forecast_scores,
+    forecasts,
+    motion_metrics,
+    score,
+    tether_length,
+)
+from sonar_imm_tools.evaluation.obstacle.series import match, series_of, TruePath, truth_of
 from sonar_imm_tools.offline.run_folder import RunFolder
 
 SECOND = 10**9
@@ -35,23 +41,17 @@ def estimate(second, rows):
     covariance = np.zeros((len(rows), 3, 3))
     covariance[:, [0, 1], [0, 1]] = 1e-2, 1e-4
     covariance[:, 2, 2] = rows[:, 5] ** 2
+    extras = {
+        'track_id': rows[:, 0].astype(np.uint32), 'track_state': rows[:, 1].astype(np.uint8),
+        'vertical_offset_lo': rows[:, 6], 'vertical_offset_hi': rows[:, 7],
+        'nis': np.full(len(rows), 2.0),
+    }  # fmt: skip
     return Estimate(
-        stamp_ns=second * SECOND,
-        frame_id='odom',
-        xyz=np.column_stack([rows[:, 2], rows[:, 3], rows[:, 4]]).astype(np.float32),
-        state_names=('range', 'bearing', 'vertical_offset'),
-        state=rows[:, 2:5],
-        covariance=covariance,
-        model_names=('above', 'below'),
-        probabilities=np.column_stack([rows[:, 8], 1.0 - rows[:, 8]]),
-        extras={
-            'track_id': rows[:, 0].astype(np.uint32),
-            'track_state': rows[:, 1].astype(np.uint8),
-            'vertical_offset_lo': rows[:, 6],
-            'vertical_offset_hi': rows[:, 7],
-            'nis': np.full(len(rows), 2.0),
-        },
-    )
+        stamp_ns=second * SECOND, frame_id='odom', xyz=rows[:, 2:5].astype(np.float32),
+        state_names=('range', 'bearing', 'vertical_offset'), state=rows[:, 2:5],
+        covariance=covariance, model_names=('above', 'below'),
+        probabilities=np.column_stack([rows[:, 8], 1.0 - rows[:, 8]]), extras=extras,
+    )  # fmt: skip
 
 
 def straight(track_id, offset, bearing=0.0, count=20):
@@ -91,19 +91,15 @@ def test_the_image_is_seen_from_above_with_starboard_to_the_right():
 
 def test_the_map_shows_the_way_and_names_each_track():
     rows = [[k, 1, 10.0 * k, 0.2, 3.0, 1.0, 2.0, 5.0, 0.1] for k in (4, 7)]
+    level = [0.0, 0.0, 0.0, 1.0]
     way = [
-        Navigation(
-            stamp_ns=s * SECOND, position=[3.0 * s, s, 0.0], orientation=[0.0, 0.0, 0.0, 1.0]
-        )
+        Navigation(stamp_ns=s * SECOND, position=[3.0 * s, s, 0.0], orientation=level)
         for s in (1, 2)
     ]
     (section,) = map_section(series_of([estimate(10, rows)]), way, None)
     vehicle, *tracks = section.figure.data
-    assert (list(vehicle.x), list(vehicle.y), vehicle.hovertemplate) == (
-        [3.0, 6.0],
-        [1.0, 2.0],
-        None,
-    )
+    assert list(vehicle.x) == [3.0, 6.0] and list(vehicle.y) == [1.0, 2.0]
+    assert vehicle.hovertemplate is None
     for track, number, x in zip(tracks, (4, 7), (40.0, 70.0), strict=True):
         assert list(track.x) == [x] and list(track.y) == pytest.approx([0.2])
         assert track.hovertemplate.startswith(f'track {number}: ')
@@ -163,9 +159,8 @@ def test_an_obstacle_is_asked_for_from_its_sixth_ping_until_it_is_passed():
     path = straight(1, -3.0)
     wanted = path.there(path.stamp_ns, 60.0)
     assert wanted.tolist() == [False] * 5 + [True] * 15
-    passed = TruePath(
-        1, path.stamp_ns, path.seen * [1.0, 0.0, 1.0] + [0.0, 1.5, 0.0], path.in_beam
-    )
+    aside = path.seen * [1.0, 0.0, 1.0] + [0.0, 1.5, 0.0]
+    passed = TruePath(1, path.stamp_ns, aside, path.in_beam)
     assert not passed.there(path.stamp_ns, 60.0).any()
     blind = TruePath(1, path.stamp_ns, path.seen, np.zeros(20, bool))
     assert not blind.there(path.stamp_ns, 60.0).any()
@@ -262,3 +257,117 @@ def test_an_empty_run_is_no_reason_to_stop(tmp_path):
     run = tracked(tmp_path, 'approach', detection_probability=0.0)
     verdict = judge(RunFolder(run))
     assert not verdict.accuracy(None).good and verdict.part([]).sections
+
+
+# -- velocities, behaviours and forecasts of collisions -------------------------------------------
+
+
+def moving_estimate(second, distance, risk, velocity=(0.0, 0.0), does=(1.0, 0.0, 0.0, 0.0)):
+    """One confirmed track at bearing and offset 0, with a variance of 0.01 of its velocity."""
+    unit = np.ones(1)
+    made = estimate(second, [[1, 1, distance, 0.0, 0.0, 1.0, -1.0, 1.0, 0.5]])
+    extras = {
+        **{f'prob_{name}': share * unit for name, share in zip(BEHAVIOURS, does)},
+        'vx': velocity[0] * unit, 'vy': velocity[1] * unit, 'vel_cov_x_x': 0.01 * unit,
+        'vel_cov_x_y': 0.0 * unit, 'vel_cov_y_y': 0.01 * unit,
+        'collision_probability': risk * unit,
+    }  # fmt: skip
+    return evolve(made, extras={**made.extras, **extras})
+
+
+def path(distances, offset=0.0, velocity=(0.0, 0.0), does=0):
+    """An obstacle that was at these distances in seconds 1, 2, ..."""
+    n = len(distances)
+    seen = np.column_stack([distances, np.zeros(n), np.full(n, offset)])
+    stamps = np.arange(1, n + 1) * SECOND
+    given = np.tile(velocity, (n, 1)), np.full(n, does)
+    return TruePath(1, stamps, seen, np.ones(n, bool), *given)
+
+
+def matched(estimates, truth):
+    return match(series_of(estimates), (truth,), cutoff=5.0, gap=60.0)
+
+
+def test_scores_of_motion_are_those_done_by_hand():
+    moving = path(np.arange(60.0, 0.0, -2.0), velocity=(0.5, -0.2), does=2)
+    estimates = [
+        moving_estimate(10, 42.0, 0.4, (0.6, -0.2), (0.1, 0.1, 0.8, 0.0)),
+        moving_estimate(11, 40.0, 0.8, (0.5, 0.0), (0.0, 0.0, 1.0, 0.0)),
+    ]
+    metrics = motion_metrics(matched(estimates, moving), (moving,), ObstacleConfig())
+    scores = metrics['velocity']['moving']
+    assert scores['rmse_m_s'] == pytest.approx(np.sqrt((0.1**2 + 0.2**2) / 4.0))
+    assert scores['nees']['mean'] == pytest.approx((1.0 + 4.0) / 2.0)
+    still = path(np.arange(60.0, 0.0, -2.0))
+    alone = motion_metrics(matched(estimates[:1], still), (still,), ObstacleConfig())['velocity']
+    assert alone == {'still': {'n': 1, 'rmse_m_s': pytest.approx(np.sqrt((0.36 + 0.04) / 2.0))}}
+    shares = {'n': 2, 'fixed': 0.05, 'swaying': 0.05, 'moving': 0.9, 'seabed': 0.0}
+    assert metrics['behaviours']['confusion']['moving'] == pytest.approx(shares)
+    assert metrics['behaviours']['brier'] == pytest.approx((0.01 + 0.01 + 0.04) / 2.0)
+    # It comes as near as 2 m: both forecasts of a collision within 3 m come true.
+    assert metrics['collisions']['brier'] == pytest.approx((0.36 + 0.04) / 2.0)
+    assert metrics['collisions']['bins']['0.3 to 0.6'] == {'n': 1, 'stated': 0.4, 'came_true': 1.0}
+
+
+def every_row(distances, truth):
+    """Each estimate matched with the obstacle."""
+    n = len(distances)
+    found = matched([moving_estimate(k + 1, d, 0.5) for k, d in enumerate(distances)], truth)
+    return evolve(found, row=np.arange(n), target=np.zeros(n, int))
+
+
+@pytest.mark.parametrize(
+    'distances, offset, came',
+    [
+        ([40.0, 20.0, 2.0, 20.0], 0.0, [1, 1, 1, 0]),  # hit, and then passed
+        ([40.0, 20.0, 4.0, 20.0], 0.0, [0, 0, 0, 0]),  # passed too far aside
+        ([40.0, 20.0, 2.9, 20.0], 2.5, [0, 0, 0, 0]),  # below
+        ([40.0, 30.0, 20.0, 10.0], 0.0, []),  # the truth ends before anyone can know
+    ],
+)
+def test_a_forecast_counts_where_its_outcome_is_known(distances, offset, came):
+    truth = path(distances, offset)
+    stated, happened = forecasts(every_row(distances, truth), (truth,), ObstacleConfig())
+    assert happened.astype(int).tolist() == came
+    assert len(stated) == len(came)
+
+
+def test_what_comes_after_the_horizon_is_no_collision():
+    truth = path([40.0, 30.0, 20.0, 10.0, 1.0, 10.0])
+    _, happened = forecasts(
+        every_row([10.0] * 6, truth), (truth,), ObstacleConfig(cpa_horizon=2.0)
+    )
+    assert happened.astype(int).tolist() == [0, 0, 1, 1, 1, 0]
+    # Within the horizon of the end of the truth nothing is known.
+    truth = path([40.0, 30.0, 20.0, 10.0])
+    _, happened = forecasts(
+        every_row([10.0] * 4, truth), (truth,), ObstacleConfig(cpa_horizon=2.0)
+    )
+    assert happened.astype(int).tolist() == [0, 0]
+
+
+def test_forecasts_as_often_right_as_stated_lie_on_the_diagonal():
+    rng = np.random.default_rng(1)
+    stated = rng.uniform(0.0, 1.0, 20_000)
+    scores = forecast_scores(stated, rng.uniform(size=20_000) < stated)
+    assert scores['brier'] == pytest.approx(1.0 / 6.0, abs=0.01)
+    for each in scores['bins'].values():
+        assert each['came_true'] == pytest.approx(each['stated'], abs=0.04)
+
+
+def test_what_was_not_told_is_not_scored():
+    plain = TruePath(1, path([9.0] * 9).stamp_ns, path([9.0] * 9).seen, np.ones(9, bool))
+    found = matched([moving_estimate(8, 9.0, np.nan)], plain)
+    assert motion_metrics(found, (plain,), ObstacleConfig()) == {}
+
+
+def test_a_run_is_scored_and_the_page_shows_the_calibration(tmp_path):
+    changes = {'first_range': 45.0, 'last_range': -25.0, 'vertical_offset': 0.5}
+    folder = tracked(tmp_path, 'mover', 2, **changes)
+    page = tmp_path / 'page.html'
+    assert main(['evaluate', str(folder), '--report', str(page)]) == 0
+    metrics = json.loads((folder / 'metrics.json').read_text())
+    assert metrics['velocity']['moving']['rmse_m_s'] < 0.3
+    assert metrics['behaviours']['confusion']['moving']['moving'] > 0.9
+    assert metrics['collisions']['n'] > 20
+    assert 'Calibration of the probability of a collision' in page.read_text()

@@ -6,30 +6,27 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Numpy archives of snapshots and traces, traces as CSV and SEG-Y."""
+"""Numpy archives of snapshots and traces, and traces as CSV."""
 
 import math
-import sys
+import time
 import zipfile
 
-from helpers.segy_files import write_segy
+from helpers.field_files import measured, truth_of
 import numpy as np
 import pytest
 
-from msg_adapters.estimates import read_estimate
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.geometry import rotation_of_quaternion
 from sonar_imm.measurements import Navigation
-from sonar_imm_tools.cli import main
 from sonar_imm_tools.cli.track import Plan
 from sonar_imm_tools.recordings.convert import (
-    convert_segy,
+    convert_hydrophones,
     convert_snapshots,
     convert_traces,
     KINDS,
 )
-from sonar_imm_tools.recordings.measurements import measurements_of
-from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 
 
@@ -41,19 +38,9 @@ def convert(tmp_path):
         np.savez(tmp_path / 'pings.npz', **arrays)
         out = tmp_path / 'bag'
         report = convert_snapshots(tmp_path / 'pings.npz', out, **(options or {}))
-        with BagReader(out) as bag:
-            received = [item.measurement for item in measurements_of(bag, 'bathymetry')]
-            truth = [
-                read_estimate(item.message)
-                for item in bag.messages()
-                if item.topic == '/truth/estimate'
-            ]
-        return report, received, truth
+        return report, measured(out, 'bathymetry'), truth_of(out)
 
     return run
-
-
-POSE = {'x': 1.0, 'y': 2.0, 'heading': 90.0}
 
 
 def samples(*shape):
@@ -64,27 +51,20 @@ def samples(*shape):
 RANGE = 17.0 + 0.25 * np.arange(10)
 
 
-def test_one_ping(convert):
-    iq = samples(10, 4)
-    report, (item,), truth = convert(
-        iq=iq, range=RANGE, sound_speed=1500.0, frequency=450e3, spacing_wavelengths=0.5
-    )
-    assert KINDS['snapshots'] is convert_snapshots and report.messages == {'/snapshot': 1}
-    assert (item.iq == iq).all() and (item.range == RANGE).all() and not truth
-    assert item.spacing_wavelengths == pytest.approx(0.5, rel=1e-6)
-    assert item.element_spacing == pytest.approx(1500.0 / 900e3, rel=1e-6)
-
-
-def test_many_pings_with_stamps_and_own_variances(convert):
+def test_pings_with_stamps_and_own_variances(convert):
     iq, noise = samples(3, 10, 4), np.array([1.0, 2.0, 3.0])[:, None] * np.ones(10)
-    report, received, _ = convert(
-        iq=iq, range=RANGE, stamp=[5.0, 6.5, 7.0], noise_variance=noise, snr=np.arange(1.0, 11.0)
-    )
-    assert report.rows == 3
+    report, received, truth = convert(
+        iq=iq, range=RANGE, stamp=[5.0, 6.5, 7.0], noise_variance=noise, snr=np.arange(1.0, 11.0),
+        sound_speed=1500.0, frequency=450e3, spacing_wavelengths=0.5,
+    )  # fmt: skip
+    assert report.rows == 3 and report.messages == {'/snapshot': 3} and not truth
     assert [item.stamp_ns for item in received] == [5 * 10**9, 65 * 10**8, 7 * 10**9]
     for k, entry in enumerate(received):
         assert (entry.iq == iq[k]).all() and (entry.noise_variance == k + 1.0).all()
         assert np.allclose(entry.signal_variance, (k + 1.0) * np.arange(1.0, 11.0))
+        assert (entry.range == RANGE).all()
+        assert entry.spacing_wavelengths == pytest.approx(0.5, rel=1e-6)
+        assert entry.element_spacing == pytest.approx(1500.0 / 900e3, rel=1e-6)
 
 
 def test_without_stamps_pings_follow_the_rate(convert):
@@ -224,30 +204,30 @@ def test_bad_pings_are_left_out_and_named(convert):
 @pytest.mark.parametrize(
     'options, arrays, word',
     [
-        ({}, {'range': RANGE}, 'no array iq or'),
-        ({}, {'iq': samples(10, 4)}, 'no array range or .* or time'),
-        ({}, {'iq': samples(1, 4, 10), 'range': RANGE, 'x': 0, 'y': 0, 'yaw': 0}, 'for 4 bins'),
-        ({}, {'iq': np.ones((10, 4)), 'range': RANGE}, 'complex'),
-        ({}, {'iq': samples(10), 'range': RANGE}, 'shape'),
-        ({}, {'iq': samples(10, 4), 'range': RANGE[:9]}, 'nothing that could be converted'),
-        ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': [1.0, 2.0]}, 'stamps'),
-        ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': [np.inf]}, 'stamps'),
-        ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': [1e300]}, 'before 2038'),
-        ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': np.array(['M8', 's'])}, 'no numbers'),
-        ({}, {'iq': samples(10, 4), 'range': RANGE, 'c': np.array('x')}, "'c' holds no numbers"),
-        ({}, {'iq': samples(10, 4), 'range': RANGE.astype('m8[s]')}, "'range' holds no numbers"),
-        ({}, {'iq': samples(10, 4), 'range': RANGE, 'sound_speed': np.ones(3)},
-         'one finite number'),
-        ({'staves': [[0, 4], [1]]}, {'iq': samples(10, 4), 'range': RANGE}, 'channels 0 to 3'),
-        ({'names': {'iq': 'data'}}, {'iq': samples(10, 4), 'range': RANGE}, "no array 'data'"),
-        ({}, {'iq': samples(10, 4), 'range': RANGE[:9], **POSE}, 'nothing that could be'),
-        ({'names': {'data': 'iq'}}, {'iq': samples(10, 4), 'range': RANGE}, 'unknown array'),
-        ({}, {'iq': np.array([{}]), 'range': RANGE}, 'more than plain arrays'),
+        ({}, {'iq': None}, 'no array iq or'),
+        ({}, {'range': None}, 'no array range or .* or time'),
+        ({}, {'iq': samples(1, 4, 10), 'x': 0, 'y': 0, 'yaw': 0}, 'for 4 bins'),
+        ({}, {'iq': np.ones((10, 4))}, 'complex'),
+        ({}, {'iq': samples(10)}, 'shape'),
+        ({}, {'range': RANGE[:9]}, 'nothing that could be converted'),
+        ({}, {'stamp': [1.0, 2.0]}, 'stamps'),
+        ({}, {'stamp': [np.inf]}, 'stamps'),
+        ({}, {'stamp': [1e300]}, 'before 2038'),
+        ({}, {'stamp': np.array(['M8', 's'])}, 'no numbers'),
+        ({}, {'c': np.array('x')}, "'c' holds no numbers"),
+        ({}, {'range': RANGE.astype('m8[s]')}, "'range' holds no numbers"),
+        ({}, {'sound_speed': np.ones(3)}, 'one finite number'),
+        ({'staves': [[0, 4], [1]]}, {}, 'channels 0 to 3'),
+        ({'names': {'iq': 'data'}}, {}, "no array 'data'"),
+        ({}, {'range': RANGE[:9], 'x': 1.0, 'y': 2.0, 'heading': 90.0}, 'nothing that could be'),
+        ({'names': {'data': 'iq'}}, {}, 'unknown array'),
+        ({}, {'iq': np.array([{}])}, 'more than plain arrays'),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_converted_is_said_in_a_sentence(convert, options, arrays, word):
+    arrays = {'iq': samples(10, 4), 'range': RANGE, **arrays}
     with pytest.raises(BagError, match=word):
-        convert(options, **arrays)
+        convert(options, **{name: each for name, each in arrays.items() if each is not None})
 
 
 def test_archives_that_unpack_to_far_more_or_hold_others_cost_a_sentence(tmp_path):
@@ -284,13 +264,11 @@ def test_other_files_are_refused(tmp_path):
 
 
 DEPTH = 120.0 + 0.25 * np.arange(40)
-ONES = np.ones((3, 40))
 SECOND = 10**9
 
 
 def traces_in(path):
-    with BagReader(path) as bag:
-        return [item.measurement for item in measurements_of(bag, 'fathometer')]
+    return measured(path, 'fathometer')
 
 
 @pytest.fixture
@@ -306,24 +284,17 @@ def test_an_archive_with_truth(archive):
     amplitude = np.sin(DEPTH) * np.ones((3, 1))
     strength = np.array([[1.0, 0.3], [0.9, 0.5], [0.39, np.nan]])
     path, out = archive(
-        depth=DEPTH,
-        amplitude=amplitude,
-        sigma=[1.0, 2.0, 3.0],
-        stamp=[5.0, 6.5, 7.0],
-        reference_depth=[70.0, np.nan, 71.0],
-        reflector_amplitude=strength,
+        depth=DEPTH, amplitude=amplitude, sigma=[1.0, 2.0, 3.0], stamp=[5.0, 6.5, 7.0],
+        reference_depth=[70.0, np.nan, 71.0], reflector_amplitude=strength,
         reflector_depth=np.array([[121.0, 125.0], [121.1, 125.1], [121.2, 125.2]]),
-    )
+    )  # fmt: skip
     report = KINDS['traces'](path, out)
     assert report.messages == {'/trace': 3, '/truth/estimate': 3}
     traces = traces_in(out)
     assert [trace.stamp_ns for trace in traces] == [5 * SECOND, 65 * SECOND // 10, 7 * SECOND]
     assert [trace.reference_depth for trace in traces] == [70.0, None, 71.0]
     assert (traces[1].sigma == 2.0).all() and np.allclose(traces[1].amplitude, np.sin(DEPTH))
-    with BagReader(out) as bag:
-        truth = [
-            read_estimate(item.message).columns() for item in bag.messages(['/truth/estimate'])
-        ]
+    truth = [item.columns() for item in truth_of(out)]
     # The second is there with 0.6 and more of its greatest, the first no longer with 0.39.
     assert [list(item['track_id']) for item in truth] == [[1, 2], [1, 2], []]
     assert list(truth[1]['depth']) == [121.1, 125.1]
@@ -342,20 +313,20 @@ def test_bad_traces_are_left_out_by_name(archive):
 @pytest.mark.parametrize(
     'arrays, words',
     [
-        ({'depth': DEPTH}, "no array 'amplitude'"),
-        ({'depth': DEPTH[:5], 'amplitude': ONES}, r'\(traces, n\) are needed'),
-        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [1.0]}, '3 traces need as many'),
-        ({'depth': DEPTH, 'amplitude': np.ones((3, 40)), 'sigma': np.ones(7)},
-         'sigma has the shape'),
-        ({'depth': DEPTH, 'amplitude': np.zeros((3, 40))}, 'silent'),
-        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [1e300] * 3}, '3 traces need as many'),
-        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [3e9] * 3}, 'before 2038'),
-        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': ['a'] * 3}, "'stamp' holds no numbers"),
-        ({'depth': DEPTH, 'amplitude': ONES, 'sigma': 'x'}, "'sigma' holds no numbers"),
+        ({'amplitude': None}, "no array 'amplitude'"),
+        ({'depth': DEPTH[:5]}, r'\(traces, n\) are needed'),
+        ({'stamp': [1.0]}, '3 traces need as many'),
+        ({'sigma': np.ones(7)}, 'sigma has the shape'),
+        ({'amplitude': np.zeros((3, 40))}, 'silent'),
+        ({'stamp': [1e300] * 3}, '3 traces need as many'),
+        ({'stamp': [3e9] * 3}, 'before 2038'),
+        ({'stamp': ['a'] * 3}, "'stamp' holds no numbers"),
+        ({'sigma': 'x'}, "'sigma' holds no numbers"),
     ],
-)  # fmt: skip
+)
 def test_archives_that_make_no_sense_are_one_sentence(archive, arrays, words):
-    path, out = archive(**arrays)
+    arrays = {'depth': DEPTH, 'amplitude': np.ones((3, 40)), **arrays}
+    path, out = archive(**{name: each for name, each in arrays.items() if each is not None})
     with pytest.raises(BagError, match=words):
         convert_traces(path, out)
 
@@ -371,53 +342,91 @@ def test_a_table_has_a_row_a_sample(tmp_path):
     assert len(first) == 40 and len(second) == 39 and (first.sigma == 0.5).all()
 
 
-@pytest.fixture
-def line(tmp_path):
-    """Seven traces of 30 samples every 100 us, four a second, from a recorder that starts late."""
-    rows, path = np.arange(7), tmp_path / 'line.seg'
-    write_segy(
-        path, 100 * rows[:, None] + np.arange(30), 3, YearDataRecorded=2018, DayOfYear=72,
-        HourOfDay=23, MinuteOfHour=11, SecondOfMinute=24 + rows // 4, TRACE_SAMPLE_INTERVAL=100,
-        DelayRecordingTime=20,
+# -- the sound of an array becomes blocks of pressure that are its samples
+
+
+RATE, BEGIN_NS = 4000, 1_717_149_600 * 10**9
+
+
+def write_sound(path, channels=4, **how):
+    soundfile = pytest.importorskip('soundfile')
+    samples = 0.2 * np.random.default_rng(3).standard_normal((10_000, channels))
+    soundfile.write(path, samples, RATE, **how)
+    return soundfile.read(path, dtype='float64', always_2d=True)[0]
+
+
+def blocks_of(path):
+    return measured(path, 'fathometer')
+
+
+@pytest.mark.parametrize(
+    'name, subtype',
+    [('a.wav', 'PCM_16'), ('a.wav', 'FLOAT'), ('a.wav', 'PCM_24'), ('a.flac', 'PCM_16')],
+)
+def test_blocks_are_the_samples(tmp_path, name, subtype):
+    samples = write_sound(tmp_path / name, subtype=subtype)
+    report = convert_hydrophones(
+        tmp_path / name, tmp_path / 'out', start='2024-05-31T10:00:00Z', channels=[3, 2, 0],
+        full_scale=8.0, depth=100.0, block=0.7,
     )  # fmt: skip
-    return path
-
-
-def test_segy_traces_have_their_depth_and_time(line, tmp_path):
-    report = convert_segy(line, tmp_path / 'bag', depth_offset=2.0)
-    traces = traces_in(tmp_path / 'bag')
-    assert report.messages == {'/trace': 7}
-    assert np.allclose(traces[0].depth, 2.0 + 15.0 + 0.075 * np.arange(30), atol=1e-5)
-    assert list(traces[3].amplitude) == list(300.0 + np.arange(30))
-    start = 1520982684 * SECOND  # 2018-03-13 23:11:24 UTC
-    assert [trace.stamp_ns - start for trace in traces[:5]] == [
-        0,
-        SECOND // 4,
-        SECOND // 2,
-        3 * SECOND // 4,
-        SECOND,
+    blocks = blocks_of(report.path)
+    assert [block.stamp_ns for block in blocks] == [
+        BEGIN_NS + 700_000_000 * k for k in range(len(blocks))
     ]
+    found = np.concatenate([block.pressure for block in blocks])
+    assert found == pytest.approx(8.0 * samples[:, [3, 2, 0]], abs=1e-6)
+    assert {block.reference_depth for block in blocks} == {100.0}
+    assert {block.sample_rate for block in blocks} == {RATE}
 
 
-def test_segy_traces_are_cut_and_stacked(line, tmp_path):
-    convert_segy(line, tmp_path / 'bag', sample_spacing=0.376, first_sample=12, samples=8, stack=3)
-    traces = traces_in(tmp_path / 'bag')
-    assert len(traces) == 2 and len(traces[0]) == 8
-    assert np.allclose(traces[0].depth[0], 15.0 + 12 * 0.376)
-    assert list(traces[1].amplitude) == list(400.0 + np.arange(12, 20))
+@pytest.mark.parametrize(
+    'name', ['x_20240531_100000.wav', '5146.240531100000.wav', 'a-20240531T100000Z.wav']
+)
+def test_the_name_of_the_file_says_when_it_begins(tmp_path, name):
+    write_sound(tmp_path / name)
+    report = convert_hydrophones(tmp_path / name, tmp_path / 'out')
+    assert blocks_of(report.path)[0].stamp_ns == BEGIN_NS
+    assert report.notes['start'].startswith('2024-05-31T10:00:00Z by the name')
+    report = convert_hydrophones(tmp_path / name, tmp_path / 'zone', time_zone='+02:00')
+    assert blocks_of(report.path)[0].stamp_ns == BEGIN_NS - 7200 * 10**9
 
 
-def test_what_is_no_segy_is_one_sentence(tmp_path):
-    pytest.importorskip('segyio')
-    (tmp_path / 'note.seg').write_text('no traces here')
-    with pytest.raises(BagError, match='cannot be read'):
-        convert_segy(tmp_path / 'note.seg', tmp_path / 'bag')
-    with pytest.raises(BagError, match='cannot be read'):
-        convert_segy(tmp_path / 'absent.seg', tmp_path / 'bag')
+@pytest.mark.parametrize('start', ['0', 'now'])
+def test_a_time_that_does_not_matter(tmp_path, start):
+    write_sound(tmp_path / 'a.wav')
+    before = time.time_ns() if start == 'now' else 10**9
+    report = convert_hydrophones(tmp_path / 'a.wav', tmp_path / 'out', start=start)
+    assert 0 <= blocks_of(report.path)[0].stamp_ns - before < 60 * 10**9
 
 
-def test_without_segyio_the_command_says_how_to_get_it(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, 'segyio', None)
-    (tmp_path / 'line.seg').write_bytes(b'')
-    assert main(['convert', 'segy', str(tmp_path / 'line.seg'), str(tmp_path / 'bag')]) == 2
-    assert "pip install 'sonar_imm[segy]'" in capsys.readouterr().err
+def test_wave_files_of_the_other_byte_order_and_those_that_were_cut(tmp_path):
+    samples = write_sound(tmp_path / 'a.wav', endian='BIG')
+    content = (tmp_path / 'a.wav').read_bytes()
+    assert content[:4] == b'RIFX' and sniff(tmp_path / 'a.wav').kind == 'hydrophones'
+    write_sound(tmp_path / 'b.wav')
+    content = (tmp_path / 'b.wav').read_bytes()
+    (tmp_path / 'b.wav').write_bytes(content[: len(content) // 2])
+    for name, least, most in (('a.wav', 10_000, 10_000), ('b.wav', 4001, 5000)):
+        report = convert_hydrophones(tmp_path / name, tmp_path / f'{name}.bag', start='0')
+        found = np.concatenate([block.pressure for block in blocks_of(report.path)])
+        assert least <= len(found) <= most
+        assert found == pytest.approx(samples[: len(found)], abs=1e-6)
+
+
+def test_what_cannot_be_used_is_one_sentence(tmp_path):
+    write_sound(tmp_path / 'a.wav')
+    (tmp_path / 'b.wav').write_bytes(b'RIFF____WAVE' + bytes(50))
+    write_sound(tmp_path / 'c.wav', channels=1)
+    start = '2024-05-31T10:00:00Z'
+    for name, options, wanted in (
+        ('a.wav', {}, 'does not say when it begins'),
+        ('a.wav', {'start': 'noon'}, 'is no time'),
+        ('a.wav', {'start': start, 'channels': [0, 9]}, 'not 9'),
+        ('a.wav', {'start': start, 'block': 600.0, 'channels': [0]}, 'at least two'),
+        ('b.wav', {'start': start}, 'cannot be read as sound'),
+        ('c.wav', {'start': start}, 'one channel'),
+        ('none.wav', {'start': start}, 'cannot be read'),
+    ):
+        with pytest.raises(BagError, match=wanted):
+            convert_hydrophones(tmp_path / name, tmp_path / 'out', **options)
+        assert not (tmp_path / 'out').exists()

@@ -10,9 +10,13 @@
 is kept and counted."""
 
 from helpers.field_files import FORMATS, line
+import numpy as np
 import pytest
 
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sniffing import sniff
+from sonar_imm_tools.recordings.sources import BagError
 
 READ = [each for each in FORMATS if each.kind != 'none']
 COUNT = 20
@@ -25,22 +29,14 @@ FIXES = 'latitude 0, longitude 0 is what receivers without a fix write'
 SHIP = 'pings have no position (0, 0 is none)'
 TWO = 'does the file hold two vessels?'
 EXPECTED = {
-    'usbl.csv': [TIMES, FIXES],
-    'vessel.csv': [TIMES, FIXES, TWO],
-    'dive.gpx': [TIMES, FIXES],
-    'dive.kml': [TIMES, FIXES],
-    'dive.geojson': [TIMES, FIXES],
-    'gps.log': [TIMES, FIXES, TWO],
-    'harbour.nmea': [TIMES, FIXES],
-    'vue.csv': ['the clock jumps by'],
-    'arrivals.csv': [TIMES],
     'array_20240531_100000.wav': [],  # one clock, and no place
-    'line.seg': [TIMES],
-    'pings.npz': [TIMES],
-    'traces.npz': [TIMES],
-    'traces.csv': [TIMES],
-    'line.xtf': [TIMES, SHIP, TWO],
-    'swath.xtf': [TIMES, SHIP, TWO],
+    'vue.csv': ['the clock jumps by'],
+    **dict.fromkeys('arrivals.csv line.seg pings.npz traces.npz traces.csv'.split(), [TIMES]),
+    **dict.fromkeys(
+        'usbl.csv dive.gpx dive.kml dive.geojson harbour.nmea'.split(), [TIMES, FIXES]
+    ),
+    **dict.fromkeys(['vessel.csv', 'gps.log'], [TIMES, FIXES, TWO]),
+    **dict.fromkeys(['line.xtf', 'swath.xtf'], [TIMES, SHIP, TWO]),
     'frames': [TIMES, SHIP],
 }
 """What is printed of a file with all that; each name of `READ` but the bags, whose reader has its
@@ -123,3 +119,92 @@ def test_two_vessels_a_clock_that_jumps_and_a_receiver_without_a_fix(tmp_path, n
 
 def test_each_reader_has_been_asked():
     assert {each.name for each in READ if not each.name.endswith('.bag')} == set(EXPECTED)
+
+
+# -- what a file is taken for, by its content alone
+
+
+def segy(letter=b'\xc3'):
+    header = bytearray(3600)
+    header[:1] = letter
+    header[3220:3222], header[3224:3226] = (500).to_bytes(2, 'big'), (5).to_bytes(2, 'big')
+    return bytes(header)
+
+
+FILES = {
+    'fixes': b'stamp,x,y\n1,2,3\n',
+    'fixes   ': b'time#UTC,x,y\n1,2,3\n',
+    'fixes ': b'\xef\xbb\xbf<?xml version="1.0"?><gpx></gpx>',
+    'fixes  ': b'{ "type" : "FeatureCollection", "features": []}',
+    'relative': b'stamp,range,bearing,vessel_x,vessel_y,heading\n',
+    'arrivals': b'ping;receiver;arrival\n',
+    'arrivals ': b'stamp,transmitter,receiver,toa\n',
+    'detections': b'Date and Time (UTC),Receiver,Transmitter,Latitude,Longitude\n',
+    'traces': b'stamp,depth,amplitude\n',
+    'nmea': b'$GPHDT,45.0,T*04\r\n!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24\r\n',
+    'nmea ': b'half a line\r\n1717199990.1 $GPHDT,45.0,T*04\r\n',
+    'segy': segy(),
+    'segy ': segy(b'C'),
+    'hydrophones': b'RIFF\0\0\0\0WAVEfmt ',
+    'hydrophones ': b'fLaC\0',
+    'xtf': b'\x7b\x01' + bytes(1100),
+}
+RAW = (b'XML0', b'CON0', b'FIL1', b'#IIP', b'\x02I', b'\x02i')
+"""What stands behind the first four bytes of EK80, EK60, KMALL and .all."""
+
+
+@pytest.mark.parametrize('kind', FILES)
+def test_the_content_says_the_kind(tmp_path, kind):
+    (tmp_path / 'file.dat').write_bytes(FILES[kind])
+    assert sniff(tmp_path / 'file.dat').kind == kind.strip()
+
+
+def test_archives(tmp_path):
+    np.savez(tmp_path / 'a.npz', iq=np.zeros((3, 2), complex), range=np.zeros(3))
+    np.savez(tmp_path / 'b.npz', depth=np.zeros(3), amplitude=np.zeros(3))
+    np.savez(tmp_path / 'c.npz', other=np.zeros(3))
+    assert sniff(tmp_path / 'a.npz').kind == 'snapshots'
+    assert sniff(tmp_path / 'b.npz').kind == 'traces'
+    with pytest.raises(BagError, match='--name iq=ARRAY'):
+        sniff(tmp_path / 'c.npz')
+
+
+@pytest.mark.parametrize(
+    'content, wanted',
+    [
+        (b'', 'is empty'),
+        (b'Wann,Rechts,Hoch\n1,2,3\n', '--column stamp=HEADER'),
+        (b'stamp,Rechts,Hoch\n', '--column x=HEADER'),
+        (bytes(range(256)) * 4, 'no text'),
+        (b'PK\x03\x04 and nothing', 'damaged archive'),
+        *((b'\0\0\0\x10' + name + bytes(100), 'raw file of an echo sounder') for name in RAW),
+        (b'[{"measurement": []}]', r'JSON and no GeoJSON.* as CSV \(kind fixes\)'),
+    ],
+)
+def test_what_is_not_known_is_said_with_what_would_help(tmp_path, content, wanted):
+    (tmp_path / 'file.dat').write_bytes(content)
+    with pytest.raises(BagError, match=wanted):
+        sniff(tmp_path / 'file.dat')
+
+
+@pytest.mark.parametrize('words', [(), ('ek80',)])
+def test_a_raw_file_of_an_echo_sounder_says_what_to_do(tmp_path, capsys, words):
+    path = tmp_path / 'D20221108.raw'
+    path.write_bytes((100).to_bytes(4, 'little') + b'XML0' + bytes(100))
+    assert main(['convert', *words, str(path), str(tmp_path / 'bag')]) == 2
+    (sentence,) = (
+        line for line in capsys.readouterr().err.splitlines() if 'kind snapshots' in line
+    )
+    assert 'XTF' in sentence and not (tmp_path / 'bag').exists()
+
+
+def test_columns_that_are_named_settle_it_without_the_kind(tmp_path, capsys):
+    table, bag = tmp_path / 'ausgabe.csv', tmp_path / 'bag'
+    table.write_text('Wann,Rechts,Hoch\n0,1,2\n1,2,3\n')
+    named = ('--column', 'stamp=Wann', '--column=x=Rechts', '--column', 'y=Hoch')
+    assert main(['convert', str(table), str(bag), *named]) == 0
+    assert 'convert fixes' in capsys.readouterr().err
+    with BagReader(bag) as made:
+        assert [topic.name for topic in made.topics] == ['/fix']
+    assert main(['convert', str(table), str(tmp_path / 'other'), *named[:3]]) == 2
+    assert '--column y=HEADER' in capsys.readouterr().err

@@ -8,16 +8,14 @@
 
 """Receivers with clocks of their own, compared by tags that lie at known places."""
 
-import csv
-from datetime import datetime, timezone
-
+from helpers.case_files import text_of
+from helpers.field_files import measured
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
-from sonar_imm_tools.recordings.convert import convert_detections, CsvOptions
+from sonar_imm_tools.recordings.convert import convert_arrivals, convert_detections, CsvOptions
 from sonar_imm_tools.recordings.convert.detections import compare_clocks, gather, Received
-from sonar_imm_tools.recordings.measurements import measurements_of
-from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 
@@ -72,8 +70,7 @@ def compared(rows):
     return compare_clocks(received_of(rows), RECEIVERS, places, SPEED, 6 * 3600.0)
 
 
-@pytest.mark.parametrize('seed', range(3))
-@pytest.mark.parametrize('echoes', [0.0, 0.05])
+@pytest.mark.parametrize('seed, echoes', [(0, 0.0), (1, 0.05), (2, 0.05)])
 def test_offsets_and_drifts_are_found_within_their_error(seed, echoes):
     clocks = compared(recorded(seed, echoes)[0])
     seconds = (clocks.begin_ns - BEGIN) / SECOND + clocks.knots
@@ -92,7 +89,7 @@ def test_a_receiver_that_hears_no_fixed_tag_is_left_out_and_named(tmp_path):
     assert np.isnan(clocks.offset[3]).all() and np.isfinite(clocks.offset[:3]).all()
     report = converted(tmp_path, rows)
     assert 'r3: it shares no ping' in report.problems[0]
-    assert {rx for ping in arrivals_of(report.path) for rx in ping.rx_id} == {1, 2, 3}
+    assert {rx for ping in measured(report.path) for rx in ping.rx_id} == {1, 2, 3}
 
 
 def test_pings_hold_each_receiver_once_and_are_no_longer_than_the_window():
@@ -109,12 +106,11 @@ def test_pings_hold_each_receiver_once_and_are_no_longer_than_the_window():
 
 def converted(folder, rows, **options):
     names = ('S1', 'S2', 'A69-1601-7')
-    with (folder / 'vue.csv').open('w', newline='') as file:
-        writer = csv.writer(file)
-        writer.writerow(['Date and Time (UTC)', 'Receiver', 'Transmitter', 'Sensor Value'])
-        for receiver, tag, stamp in rows:
-            time = np.datetime64(stamp, 'ns').astype('datetime64[us]')
-            writer.writerow([str(time).replace('T', ' '), f'r{receiver}', names[tag], ''])
+    lines = ['Date and Time (UTC),Receiver,Transmitter,Sensor Value']
+    for receiver, tag, stamp in rows:
+        time = str(np.datetime64(stamp, 'ns').astype('datetime64[us]')).replace('T', ' ')
+        lines.append(f'{time},r{receiver},{names[tag]},')
+    (folder / 'vue.csv').write_text('\n'.join(lines) + '\n')
     for name, head, places in (
         ('stations', 'receiver', {f'r{k}': place for k, place in enumerate(RECEIVERS)}),
         ('sync', 'tag', dict(zip(names, SYNC))),
@@ -127,16 +123,11 @@ def converted(folder, rows, **options):
     )
 
 
-def arrivals_of(path):
-    with BagReader(path) as bag:
-        return [item.measurement for item in measurements_of(bag, 'diver')]
-
-
 def test_arrivals_of_a_tag_fit_the_place_it_had(tmp_path):
     rows, fish = recorded(2)
     report = converted(tmp_path, rows)
     assert 'r1 +' in report.notes['clocks'] and 'agree to 0.3' in report.notes['clocks']
-    pings = arrivals_of(report.path)
+    pings = measured(report.path)
     assert len(pings) == len(fish)
     error = []
     for ping, (_, place) in zip(pings, fish):
@@ -152,7 +143,7 @@ def test_without_fixed_tags_the_clocks_are_believed(tmp_path):
     report = converted(tmp_path, rows, sync=None, window=0.5)
     assert 'clocks' not in report.notes
     # Clocks that are seconds apart: nobody hears a ping together.
-    assert max(len(ping.toa) for ping in arrivals_of(report.path)) < 3
+    assert max(len(ping.toa) for ping in measured(report.path)) < 3
 
 
 def test_only_fixed_tags_is_one_sentence(tmp_path):
@@ -188,24 +179,21 @@ def heard(period=30.0, pings=20):
     )
 
 
-def text_of(t, digits=6, form='%Y-%m-%d %H:%M:%S'):
-    moment = datetime.fromtimestamp(int(t), timezone.utc).strftime(form)
-    return moment + (f'.{int(t % 1 * 10**digits):0{digits}d}' if digits else '')
-
-
 def exported(folder, head, line, rows=None, **options):
     lines = [line(t, name) for t, name in rows or heard()]
     (folder / 'export.csv').write_text('\n'.join([head, *lines]) + '\n')
     places = [f'{name},{x},{y},-3' for name, (x, y) in STATIONS.items()]
     (folder / 'stations.csv').write_text('receiver,x,y,z\n' + '\n'.join(places) + '\n')
     table = CsvOptions(time_zone='UTC', columns=options.pop('columns', {}))
-    return convert_detections(
-        folder / 'export.csv',
-        folder / 'out',
-        receivers=folder / 'stations.csv',
-        options=table,
-        **options,
-    )
+    paths = folder / 'export.csv', folder / 'out'
+    return convert_detections(*paths, receivers=folder / 'stations.csv', options=table, **options)
+
+
+VUE = 'Date and Time (UTC),Receiver,Transmitter'
+
+
+def of_vue(t, r):
+    return f'{text_of(t, 6)},{r},7'
 
 
 VDAT = (
@@ -218,23 +206,23 @@ VDAT = (
     'head, line',
     [
         ('station,receiver,tagName,codeSpace,dateCollectedUTC',
-         lambda t, r: f'S1,{r},A69-1602-7001,A69-1602,{text_of(t)}'),
+         lambda t, r: f'S1,{r},A69-1602-7001,A69-1602,{text_of(t, 6)}'),
         ('animal_id,detection_timestamp_utc,transmitter_codespace,transmitter_id,receiver_sn',
-         lambda t, r: f'9,{text_of(t)},A69-1602,7001,{r}'),
+         lambda t, r: f'9,{text_of(t, 6)},A69-1602,7001,{r}'),
         ('date_time,tag_serial_number,acoustic_tag_id,receiver_id,station_name',
-         lambda t, r: f'{text_of(t)},1187,A69-1602-7001,{r},bh'),
+         lambda t, r: f'{text_of(t, 6)},1187,A69-1602-7001,{r},bh'),
         ('Timestamp,Receiver,CodeSpace,Signal,Valid',
-         lambda t, r: f'{text_of(t)},{r},A69-1602,7001,TRUE'),
+         lambda t, r: f'{text_of(t, 6)},{r},A69-1602,7001,TRUE'),
         ('Date,Time,TOA,Tag ID,Receiver,Power',
          lambda t, r: f'{text_of(t, 0, "%m/%d/%y")},{text_of(t, 0, "%H:%M:%S")},{t % 1:.6f},'
                       f'A69-1602-7001,{r},147'),
         ('Date and Time (UTC),ID,Data,Protocol,Receiver,Microsecond',
          lambda t, r: f'{text_of(t, 0)},A69-1602-7001,0,S256,{r},{int(t % 1 * 1e6)}'),
         (VDAT,
-         lambda t, r: f'DIAG,{text_of(t)},{r[:3]}\nDET,{text_of(t)},{text_of(t)},VR2,{r[4:]},69,'
-                      'A69-1602-7001,7001'),
+         lambda t, r: f'DIAG,{text_of(t, 6)},{r[:3]}\n'
+                      f'DET,{2 * (text_of(t, 6) + ",")}VR2,{r[4:]},69,A69-1602-7001,7001'),
         ('Date and Time (UTC),Receiver,Transmitter',
-         lambda t, r: f'{text_of(t)},{r[4:]},A69-1602-7001'),
+         lambda t, r: f'{text_of(t, 6)},{r[4:]},A69-1602-7001'),
     ],
     ids='otn glatos etn actel lotek thelma vdat serial_number'.split(),
 )  # fmt: skip
@@ -242,7 +230,7 @@ def test_exports_of_makers_and_networks(tmp_path, head, line):
     report = exported(tmp_path, head, line)
     assert (report.bad_rows, report.messages) == (0, {'/arrivals': 20})
     assert 'A69-1602-7001 is 1' in report.notes['tag']
-    first = arrivals_of(report.path)[0]
+    first = measured(report.path)[0]
     assert sorted(first.rx_id) == [1, 2, 3, 4]
     wanted = [t for t, _ in heard()[:4]]
     assert first.stamp_ns * 1e-9 == pytest.approx(wanted[0], abs=2e-6)
@@ -253,9 +241,9 @@ def test_exports_of_makers_and_networks(tmp_path, head, line):
 def test_detections_that_are_marked_as_invalid_are_left_out(tmp_path):
     head = 'Timestamp,Receiver,Transmitter,Valid'
     report = exported(
-        tmp_path, head, lambda t, r: f'{text_of(t)},{r},7,{str(r != "VR2-101").upper()}'
+        tmp_path, head, lambda t, r: f'{text_of(t, 6)},{r},7,{str(r != "VR2-101").upper()}'
     )
-    assert report.bad_rows == 20 and set(arrivals_of(report.path)[0].rx_id) == {2, 3, 4}
+    assert report.bad_rows == 20 and set(measured(report.path)[0].rx_id) == {2, 3, 4}
 
 
 @pytest.mark.parametrize(
@@ -263,8 +251,7 @@ def test_detections_that_are_marked_as_invalid_are_left_out(tmp_path):
     [(0, None, '1 s, 1.5e+03 m'), (1, 0.1, '0.1 s, 150 m'), (2, 0.01, '0.01 s'), (6, None, '')],
 )
 def test_the_resolution_of_stamps_is_said_and_heeded(tmp_path, digits, std, words):
-    head = 'Date and Time (UTC),Receiver,Transmitter'
-    args = tmp_path, head, lambda t, r: f'{text_of(t, digits)},{r},7'
+    args = tmp_path, VUE, lambda t, r: f'{text_of(t, digits)},{r},7'
     if digits == 0:
         with pytest.raises(BagError) as caught:
             exported(*args)
@@ -273,36 +260,176 @@ def test_the_resolution_of_stamps_is_said_and_heeded(tmp_path, digits, std, word
         return
     report = exported(*args)
     assert words in report.notes.get('resolution', '')
-    var = arrivals_of(report.path)[0].var_toa
+    var = measured(report.path)[0].var_toa
     assert var == pytest.approx(std**2 / 12) if std else np.isnan(var).all()
 
 
 def test_days_of_five_digits_have_a_resolution_too(tmp_path):
-    head = 'excel_time,Receiver,Transmitter'
-    line = lambda t, r: f'{t / 86400 + 25569:.5f},{r},7'  # noqa: E731
+    def line(t, r):
+        return f'{t / 86400 + 25569:.5f},{r},7'
+
     with pytest.raises(BagError, match='a resolution of 0.864 s'):
-        exported(tmp_path, head, line)
+        exported(tmp_path, 'excel_time,Receiver,Transmitter', line)
 
 
 @pytest.mark.parametrize('period, words', [(0.7, '0.35 s'), (1.0, '0.5 s'), (30.0, '')])
 def test_pings_within_a_second_are_not_joined(tmp_path, period, words):
-    head = 'Date and Time (UTC),Receiver,Transmitter'
-    line = lambda t, r: f'{text_of(t)},{r},7'  # noqa: E731
-    report = exported(tmp_path, head, line, heard(period))
+    report = exported(tmp_path, VUE, of_vue, heard(period))
     assert report.messages == {'/arrivals': 20} and words in report.notes.get('window', '')
 
 
 def test_pings_faster_than_sound_crosses_the_array_are_a_question(tmp_path):
-    head = 'Date and Time (UTC),Receiver,Transmitter'
-    line = lambda t, r: f'{text_of(t)},{r},7'  # noqa: E731
     with pytest.raises(BagError, match='each 0.2 s, and sound takes 0.226 s.*--window 0.23'):
-        exported(tmp_path, head, line, heard(0.2))
-    assert exported(tmp_path, head, line, heard(0.2), window=0.23).messages
+        exported(tmp_path, VUE, of_vue, heard(0.2))
+    assert exported(tmp_path, VUE, of_vue, heard(0.2), window=0.23).messages
 
 
 def test_one_receiver_alone_is_said(tmp_path):
-    rows = [row for row in heard() if row[1] == 'VR2-101']
-    report = exported(
-        tmp_path, 'Time (UTC),Receiver,Tag', lambda t, r: f'{text_of(t)},{r},7', rows
-    )
+    report = exported(tmp_path, VUE, of_vue, [row for row in heard() if row[1] == 'VR2-101'])
     assert 'all detections are of VR2-101' in report.questions[0]
+
+
+# -- tables of arrival times
+
+
+THREE = 'receiver,x,y,depth\n0,0,0,1\n1,10,0,2\n2,0,20,3\n'
+
+
+@pytest.fixture
+def arrivals(tmp_path):
+    def run(text, receivers=THREE, transmitters=None, **options):
+        for name, content in (('in', text), ('rx', receivers), ('tx', transmitters)):
+            if content is not None:
+                (tmp_path / f'{name}.csv').write_text(content)
+        if transmitters is not None:
+            options['transmitters'] = tmp_path / 'tx.csv'
+        return convert_arrivals(
+            tmp_path / 'in.csv', tmp_path / 'out', receivers=tmp_path / 'rx.csv', **options
+        )
+
+    return run
+
+
+def test_one_way_arrivals_are_stamped_with_the_earliest(arrivals):
+    report = arrivals(
+        'ping,receiver,arrival_s\n7,1,100.250\n8,0,105\n7,0,100.125\n', toa_std=0.001
+    )
+    first, second = measured(report.path)
+    assert first.stamp_ns == 100_125_000_000 and first.passive
+    assert first.rx_id.tolist() == [1, 0] and first.toa.tolist() == [0.125, 0.0]
+    assert first.rx.tolist() == [[10, 0, -2], [0, 0, -1]]
+    assert first.var_toa == pytest.approx([1e-6, 1e-6]) and np.isnan(first.bearing).all()
+    assert len(second) == 1 and second.stamp_ns == 105 * 10**9
+    assert 'earliest arrival' in report.notes['emission']
+
+
+def test_travel_times_from_transmitters(arrivals):
+    report = arrivals(
+        'stamp,tx,rx,toa_ms,std_toa,bearing,std_bearing\n'
+        '5,A,1,12.5,1e-4,0.5,0.1\n5,A,0,10,,,\n6,B,2,7,,,\n',
+        transmitters='transmitter,x,y,z\nA,1,2,3\nB,4,5,6\n',
+    )
+    first, second = measured(report.path)
+    assert first.stamp_ns == 5 * 10**9 and not first.passive
+    assert first.tx.tolist() == [[1, 2, 3], [1, 2, 3]] and second.tx.tolist() == [[4, 5, 6]]
+    assert first.tx_id.tolist() == [1, 1] and second.tx_id.tolist() == [2]
+    assert first.toa == pytest.approx([0.0125, 0.010])
+    assert first.var_toa[0] == pytest.approx(1e-8) and np.isnan(first.var_toa[1])
+    assert first.bearing[0] == 0.5 and first.var_bearing[0] == pytest.approx(0.01)
+    assert np.isnan(first.bearing[1])
+
+
+def test_transmitters_may_be_among_the_receivers(arrivals):
+    (ping,) = measured(arrivals('stamp,transmitter,receiver,toa\n5,2,1,0.1\n').path)
+    assert ping.tx.tolist() == [[0, 20, -3]] and ping.tx_id.tolist() == [2]
+
+
+def test_elevation_and_the_depth_a_diver_reports_are_kept(arrivals):
+    report = arrivals(
+        'stamp,transmitter,receiver,toa,elevation,std_elevation,depth,std_depth\n'
+        '5,2,1,0.1,-0.2,0.01,11.5,0.2\n'
+    )
+    (ping,) = measured(report.path)
+    assert ping.elevation.tolist() == [-0.2] and ping.depth.tolist() == [11.5]
+    assert ping.var_elevation[0] == pytest.approx(1e-4)
+    assert ping.var_depth[0] == pytest.approx(0.04)
+
+
+def test_bad_rows_are_named(arrivals):
+    report = arrivals(
+        'ping,receiver,arrival\n1,0,5\n1,9,5\n,0,5\n1,1,x\n',
+        receivers=THREE + '2,5,5,5\n,1,1,1\n3,x,1,1\n',
+    )
+    assert report.bad_rows == 6 and len(measured(report.path)) == 1
+    text = ' / '.join(report.problems)
+    for words in (
+        "line 5: receiver '2' is listed twice",
+        'line 6: the receiver has no name',
+        "line 7: x is 'x'",
+        "line 3: the position of receiver '9'",
+        'line 4: the ping is empty',
+        "line 5: arrival is 'x'",
+    ):
+        assert words in text
+
+
+def test_named_receivers_are_numbered_and_told(arrivals):
+    report = arrivals(
+        'ping,receiver,arrival\n1,north,5\n1,south,6\n',
+        receivers='name,x,y\nsouth,0,0\nnorth,0,9\n',
+    )
+    assert measured(report.path)[0].rx_id.tolist() == [2, 1]
+    assert report.notes['receivers'] == 'south = 1, north = 2'
+
+
+@pytest.mark.parametrize(
+    'text, receivers, words',
+    [
+        ('a,b\n', THREE, 'no column for receiver'),
+        ('receiver,foo\n', THREE, 'no column for ping and arrival'),
+        ('transmitter,receiver,toa\n', THREE, 'no column for stamp'),
+        ('ping,receiver,arrival\n', 'receiver,x\n', 'no column for y'),
+        ('ping,receiver,arrival\n', 'receiver,x,y\n', 'lists no receiver'),
+        ('ping,receiver,arrival\n', THREE, 'nothing that could be converted'),
+    ],
+)
+def test_files_of_another_kind_are_explained(arrivals, text, receivers, words):
+    with pytest.raises(BagError, match=words):
+        arrivals(text, receivers)
+
+
+def test_the_real_arrivals_lead_back_to_the_fixes(real_data, tmp_path):
+    folder = real_data / 'yaps_ssu1'
+    report = convert_arrivals(
+        folder / 'arrivals.csv',
+        tmp_path / 'bag',
+        receivers=folder / 'receivers.csv',
+        truth=folder / 'gps_truth.csv',
+    )
+    assert report.messages == {'/arrivals': 123, '/truth/estimate': 450} and not report.bad_rows
+    pings = measured(report.path)
+    assert sum(len(ping) for ping in pings) == 2008 and all(ping.passive for ping in pings)
+    fixes = np.loadtxt(folder / 'fixes.csv', delimiter=',', skiprows=1)
+    ping = min(pings, key=lambda item: abs(item.stamp_ns * 1e-9 - fixes[5, 0]))
+
+    def residuals(unknown):
+        where = np.array([unknown[0], unknown[1], -1.0])
+        return np.linalg.norm(ping.rx - where, axis=1) / 1545.0 + unknown[2] / 1545.0 - ping.toa
+
+    solved = least_squares(residuals, [80.0, -80.0, 0.0], loss='soft_l1', f_scale=1e-3).x
+    assert np.hypot(*(solved[:2] - fixes[5, 1:3])) < 1.0  # the fixes are another robust solution
+
+
+def test_a_tag_that_is_named_keeps_its_number(arrivals):
+    rows = [
+        f'{ping},{tag},{receiver},{100 + ping + 0.01 * receiver}'
+        for ping in (1, 2)
+        for tag in ('amy', 'bob')
+        for receiver in (0, 1, 2)
+    ]
+    report = arrivals('\n'.join(['ping,tag,receiver,arrival', *rows]) + '\n')
+    assert report.messages == {'/arrivals': 4}
+    assert report.notes['tag'] == 'amy is 1, bob is 2'
+    pings = measured(report.path)
+    assert sorted(ping.tx_id[0] for ping in pings) == [1, 1, 2, 2]
+    assert all(ping.passive and len(set(ping.tx_id.tolist())) == 1 for ping in pings)

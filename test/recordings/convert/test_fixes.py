@@ -7,14 +7,20 @@
 # language governing permissions and limitations under the License.
 
 import csv
+import json
 import math
+import struct
 
+from helpers.field_files import measured, truth_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import pymap3d
 import pytest
+from scipy.integrate import quad
+from scipy.optimize import brentq
 import yaml
 
-from msg_adapters.estimates import read_estimate
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm_tools.recordings.conversion import MOST_NAMED
 from sonar_imm_tools.recordings.convert import (
@@ -24,30 +30,9 @@ from sonar_imm_tools.recordings.convert import (
     CsvOptions,
     KINDS,
 )
-from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.recordings.truth import difference_velocity, number_names
-
-
-@pytest.fixture
-def convert(tmp_path):
-    def run(text, kind='fixes', **options):
-        source = tmp_path / 'in.csv'
-        source.write_text(text)
-        return KINDS[kind](source, tmp_path / 'out', **options)
-
-    return run
-
-
-def fixes_of(path):
-    with BagReader(path) as bag:
-        return [item.measurement for item in measurements_of(bag, 'diver')]
-
-
-def truth_of(path):
-    with BagReader(path) as bag:
-        return [read_estimate(item.message) for item in bag.messages(['/truth/estimate'])]
 
 
 def test_bad_rows_are_named_by_line_and_the_rest_is_converted(convert):
@@ -57,7 +42,7 @@ def test_bad_rows_are_named_by_line_and_the_rest_is_converted(convert):
     assert [problem.split(':')[0] for problem in report.problems] == [
         f'in.csv, line {line}' for line in (3, 4, 5, 6, 7)
     ]
-    fixes = fixes_of(report.path)
+    fixes = measured(report.path)
     assert [fix.stamp_ns for fix in fixes] == [4 * 10**9, 5 * 10**9]  # sorted by stamp
     assert fixes[0].position.tolist() == [3.0, 4.0, 0.0] and fixes[0].frame_id == 'map'
 
@@ -67,7 +52,7 @@ def test_rows_that_say_whose_they_are_become_scans_with_identities(convert):
     report = convert('stamp,x,y,name\n' + rows)
     assert report.messages == {'/fixes': 4} and report.notes['id'] == 'cod is 1, ling is 2'
     assert report.problems == ['in.csv, line 5: cod is there at this time']
-    scans = fixes_of(report.path)
+    scans = measured(report.path)
     assert [scan.target_id.tolist() for scan in scans] == [[1, 2], [1], [2, -1], [1]]
     assert scans[2].position[:, :2].tolist() == [[3.0, 5.0], [8.0, 8.0]]
     assert scans[0].covariance is None
@@ -75,13 +60,10 @@ def test_rows_that_say_whose_they_are_become_scans_with_identities(convert):
 
 @pytest.mark.parametrize(
     'header, words',
-    [
-        ('stamp,lat', 'no column for longitude'),
-        ('stamp,Longitude', 'no column for latitude'),
-        ('stamp,foo', 'nor for latitude and longitude; it has stamp, foo'),
-        ('stamp,x', 'no column for y'),
-    ],
-)
+    [('stamp,lat', 'no column for longitude'), ('stamp,Longitude', 'no column for latitude'),
+     ('stamp,foo', 'nor for latitude and longitude; it has stamp, foo'),
+     ('stamp,x', 'no column for y')],
+)  # fmt: skip
 def test_a_table_without_a_position_is_told_what_is_missing(convert, header, words):
     with pytest.raises(BagError, match=words):
         convert(header + '\n5,1\n')
@@ -89,7 +71,7 @@ def test_a_table_without_a_position_is_told_what_is_missing(convert, header, wor
 
 def test_numbers_of_divers_stay_and_numbers_of_rows_name_nobody(convert, tmp_path):
     report = convert('stamp,x,y,id,std\n5,1,2,17,.5\n6,1,2,17,.5\n7,3,4,4,\n8,3,4,4,.5\n')
-    scans = fixes_of(report.path)
+    scans = measured(report.path)
     assert [scan.target_id.tolist() for scan in scans] == [[17], [17], [4], [4]]
     assert scans[0].covariance[:, :2, :2].tolist() == [[[0.25, 0.0], [0.0, 0.25]]]
     assert scans[2].covariance is None and 'id' not in report.notes
@@ -98,37 +80,29 @@ def test_numbers_of_divers_stay_and_numbers_of_rows_name_nobody(convert, tmp_pat
     assert rows.messages == {'/fix': 3} and 'names no diver' in rows.notes['id']
 
 
-def test_many_bad_rows_are_counted_but_not_all_listed(convert):
-    report = convert('stamp,x,y\n5,1,2\n' + 'bad,1,2\n' * 500)
-    assert report.bad_rows == 500 and len(report.problems) == MOST_NAMED + 1
-
-
-def test_nothing_good_is_an_error_and_leaves_no_bag(convert, tmp_path):
+def test_nothing_good_is_an_error_and_many_bad_rows_are_not_all_listed(convert, tmp_path):
     with pytest.raises(BagError, match='line 2'):
         convert('stamp,x,y\nbad,1,2\n')
     with pytest.raises(BagError, match='nothing that could be converted'):
         convert('stamp,x,y\n')
     assert not (tmp_path / 'out').exists()
+    report = convert('stamp,x,y\n5,1,2\n' + 'bad,1,2\n' * 500)
+    assert report.bad_rows == 500 and len(report.problems) == MOST_NAMED + 1
 
 
 @pytest.mark.parametrize(
     'header, cells, covariance',
     [
         ('var_x,cov_xy,var_y', '4,1,9', [[4, 1], [1, 9]]),
-        ('var_x,var_y', '4,9', [[4, 0], [0, 9]]),
-        ('std_x,std_y', '2,3', [[4, 0], [0, 9]]),
+        ('var_x,var_y', '4,9', [[4, 0], [0, 9]]), ('std_x,std_y', '2,3', [[4, 0], [0, 9]]),
         ('accuracy', '3', [[9, 0], [0, 9]]),
         ('sigma_east,sigma_north', '2,3', [[4, 0], [0, 9]]),
-        ('std', '', None),
-        ('std', '-1', None),
-        ('std', '0', None),
-        ('var_x,cov_xy,var_y', '-1,0,4', None),
-        ('var_x,cov_xy,var_y', '4,,9', None),
-        ('foo', '3', None),
+        ('std', '', None), ('std', '-1', None), ('std', '0', None), ('foo', '3', None),
+        ('var_x,cov_xy,var_y', '-1,0,4', None), ('var_x,cov_xy,var_y', '4,,9', None),
     ],
-)
+)  # fmt: skip
 def test_uncertainty_in_every_form(convert, header, cells, covariance):
-    (fix,) = fixes_of(convert(f'stamp,x,y,{header}\n5,1,2,{cells}\n').path)
+    (fix,) = measured(convert(f'stamp,x,y,{header}\n5,1,2,{cells}\n').path)
     assert (None if fix.covariance is None else fix.covariance[:2, :2].tolist()) == covariance
 
 
@@ -147,12 +121,12 @@ def test_uncertainty_in_every_form(convert, header, cells, covariance):
     ],
 )
 def test_the_uncertainty_of_z(convert, tmp_path, header, cells, of_z):
-    (fix,) = fixes_of(convert(f'stamp,x,y,{header}\n5,1,2,{cells}\n').path)
+    (fix,) = measured(convert(f'stamp,x,y,{header}\n5,1,2,{cells}\n').path)
     expected = [math.nan] * 3 if of_z is None else of_z
     assert fix.covariance[2] == pytest.approx(expected, nan_ok=True)
     rows = ''.join(f'{second},{second},2,A,{cells}\n' for second in (5, 6))
     (tmp_path / 'named.csv').write_text(f'stamp,x,y,id,{header}\n{rows}')
-    scans = fixes_of(convert_fixes(tmp_path / 'named.csv', tmp_path / 'named').path)
+    scans = measured(convert_fixes(tmp_path / 'named.csv', tmp_path / 'named').path)
     assert scans[0].covariance[0, 2] == pytest.approx(expected, nan_ok=True)
 
 
@@ -162,28 +136,25 @@ def test_an_impossible_covariance_is_a_bad_row(convert, cells):
     assert report.bad_rows == 1 and 'line 2' in report.problems[0]
 
 
-def test_depth_points_down_and_z_up(convert):
-    (fix,) = fixes_of(convert('stamp,x,y,depth\n5,1,2,7\n').path)
-    assert fix.position[2] == -7.0
-
-
 def test_columns_units_and_delimiters_of_other_people(convert):
     report = convert(
-        'when;rechts;hoch\n1500,5;1,5;2,5\n',
+        'when;rechts;hoch;depth\n1500,5;1,5;2,5;7\n',
         frame_id='pool',
         options=CsvOptions(columns={'stamp': 'when', 'x': 'rechts', 'y': 'hoch'}, time_unit='ms'),
     )
-    (fix,) = fixes_of(report.path)
-    assert fix.stamp_ns == 1_500_500_000 and fix.position[:2].tolist() == [1.5, 2.5]
+    (fix,) = measured(report.path)
+    assert fix.stamp_ns == 1_500_500_000 and fix.position.tolist() == [1.5, 2.5, -7.0]
     assert fix.frame_id == 'pool'
 
 
 @pytest.mark.parametrize('origin', [None, (50.0, 8.0), (50.0, 8.0, 100.0)])
 def test_latitudes_become_metres_around_the_origin(convert, origin):
+    with pytest.raises(BagError, match='an origin is'):
+        convert('time,lat,lon\n5,50,8\n', origin=(91.0, 0.0))
     report = convert(
         'time,lat,lon,alt\n5,50.001,8.002,90\n6,50.003,8.004,95\n7,91,8,0\n', origin=origin
     )
-    first, second = fixes_of(report.path)
+    first, second = measured(report.path)
     around = origin or (50.001, 8.002)
     around = (*around, 0.0)[:3]
     for fix, place in ((first, (50.001, 8.002, 90.0)), (second, (50.003, 8.004, 95.0))):
@@ -195,21 +166,9 @@ def test_latitudes_become_metres_around_the_origin(convert, origin):
     assert f'latitude {around[0]!r}' in report.notes['origin']
     with BagReader(report.path) as bag:
         assert bag.custom_data['origin'] == report.notes['origin']
-
-
-def test_a_bad_origin_is_explained(convert):
-    with pytest.raises(BagError, match='an origin is'):
-        convert('time,lat,lon\n5,50,8\n', origin=(91.0, 0.0))
-
-
-def test_the_same_input_gives_the_same_bag(convert, tmp_path):
-    text = 'stamp,x,y\n5,1,2\n6,2,3\n'
-    first = {file.name: file.read_bytes() for file in convert(text).path.iterdir()}
-    (tmp_path / 'out').rename(tmp_path / 'before')
-    second = {file.name: file.read_bytes() for file in convert(text).path.iterdir()}
-    assert first == second
-    with pytest.raises(BagError, match='exists already'):
-        convert(text)
+    # The tracker is told it.
+    (told,) = yaml.safe_load((report.path / 'parameters.yaml').read_text()).values()
+    assert DiverConfig.from_mapping(told['ros__parameters']).origin == around
 
 
 def test_truth_of_several_named_targets(convert):
@@ -228,26 +187,20 @@ def test_truth_of_several_named_targets(convert):
 
 
 def test_a_stated_velocity_is_kept(convert):
+    report = convert('time,latitude,longitude\n5,54.0,10.0\n6,54.0,10.1\n', 'truth', 'degrees')
+    assert report.notes['origin'] == 'latitude 54.0, longitude 10.0, height 0.0'
     report = convert('time,x,y,vx,vy\n5,0,0,0.1,0.2\n6,9,9,,0.4\n', kind='truth')
     first, second = truth_of(report.path)
     assert first.extras['vx'][0] == 0.1 and np.isnan(second.extras['vx'][0])
     assert report.notes['truth_velocity'] == 'stated' and 'origin' not in report.notes
 
 
-def test_truth_in_degrees_notes_its_origin(convert):
-    report = convert('time,latitude,longitude\n5,54.0,10.0\n6,54.0,10.1\n', kind='truth')
-    assert report.notes['origin'] == 'latitude 54.0, longitude 10.0, height 0.0'
-
-
-def test_difference_velocity_is_exact_for_constant_speed():
+def test_velocity_is_exact_for_constant_speed_and_names_become_numbers():
     stamps = np.array([0, 10**9, 4 * 10**9, 5 * 10**9]) + 10**18
     seconds = (stamps - stamps[0]) * 1e-9
     velocity = difference_velocity(stamps, np.column_stack([2.0 * seconds, -seconds]))
     assert np.allclose(velocity, [2.0, -1.0])
     assert np.isnan(difference_velocity(stamps[:1], [[1.0, 2.0]])).all()
-
-
-def test_names_become_numbers():
     assert number_names(['7', '3', '7']) == {'7': 7, '3': 3}
     assert number_names(['b', 'a', 'b']) == {'b': 1, 'a': 2}
     assert number_names(['1', '70000']) == {'1': 1, '70000': 2}
@@ -260,7 +213,7 @@ def test_the_real_fixes_and_truth(real_data, tmp_path):
     assert report.messages == {'/fix': 119, '/truth/estimate': 450} and not report.bad_rows
     with (folder / 'fixes.csv').open() as file:
         rows = list(csv.DictReader(file))
-    fixes = fixes_of(report.path)
+    fixes = measured(report.path)
     for row, fix in zip(rows, fixes):
         assert fix.stamp_ns == int(row['stamp_s'].replace('.', '')) * 1000
         assert fix.position[:2].tolist() == [float(row['east_m']), float(row['north_m'])]
@@ -270,59 +223,37 @@ def test_the_real_fixes_and_truth(real_data, tmp_path):
     stamp = np.array([estimate.stamp_ns for estimate in truth])
     place = np.array([[estimate.extras['px'][0], estimate.extras['py'][0]] for estimate in truth])
     inside = [fix for fix in fixes if stamp[0] <= fix.stamp_ns <= stamp[-1]]
-    error = [
-        np.hypot(
-            *(
-                fix.position[:2]
-                - [np.interp(fix.stamp_ns, stamp, place[:, axis]) for axis in (0, 1)]
-            )
-        )
-        for fix in inside
-    ]
+    at = [fix.stamp_ns for fix in inside]
+    true = np.column_stack([np.interp(at, stamp, column) for column in place.T])
+    error = np.array([fix.position[:2] for fix in inside]) - true
     assert len(inside) == 116
-    assert np.sqrt(np.mean(np.square(error))) == pytest.approx(3.69, abs=0.01)
-
-
-def test_the_real_truth_alone(real_data, tmp_path):
-    report = convert_truth(real_data / 'yaps_ssu1' / 'gps_truth.csv', tmp_path / 'bag')
-    speed = [
-        np.hypot(estimate.extras['vx'][0], estimate.extras['vy'][0])
-        for estimate in truth_of(report.path)
-    ]
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) == pytest.approx(3.69, abs=0.01)
+    alone = truth_of(convert_truth(folder / 'gps_truth.csv', tmp_path / 'alone').path)
+    speed = [np.hypot(each.extras['vx'][0], each.extras['vy'][0]) for each in alone]
     assert np.median(speed) == pytest.approx(0.48, abs=0.05)
 
 
-def test_flagged_rows_are_left_out_and_repeated_ones_are_counted(tmp_path):
-    source = tmp_path / 'log.csv'
+def test_flagged_rows_are_left_out_and_repeated_ones_are_counted(convert):
     lines = ['time,x,y,diver,position_valid']
     for k in range(1, 21):
         place = k - k % 2  # every position is polled twice
         lines.append(f'{k},{place},0,amy,{"false" if k > 16 else "1"}')
         lines.append(f'{k},0,{place},bob,1')
-    source.write_text('\n'.join(lines) + '\n')
-    report = convert_fixes(source, tmp_path / 'bag')
-    assert report.reasons == {'flagged invalid': 4} and report.bad_rows == 4
+    report = convert('\n'.join([*lines, '21,2,2,amy,perhaps']) + '\n')
+    assert report.reasons['flagged invalid'] == 4 and report.bad_rows == 5
+    assert "position_valid is 'perhaps', neither true nor false" in report.problems[-1]
     assert report.messages == {'/fixes': 20}
     assert report.notes['repeated'].startswith('16 rows hold a position that came before')
 
 
-def test_a_flag_that_is_neither_is_said(tmp_path):
-    source = tmp_path / 'log.csv'
-    source.write_text('time,x,y,valid\n1,1,1,\n2,2,2,perhaps\n')
-    report = convert_fixes(source, tmp_path / 'bag')
-    assert report.messages == {'/fix': 1}
-    assert "valid is 'perhaps', neither true nor false" in report.problems[0]
-
-
-def test_the_origin_of_latitudes_is_told_the_tracker(convert):
-    report = convert('time,lat,lon\n1,59.5,10.25\n2,59.50001,10.25\n')
-    content = yaml.safe_load((report.path / 'parameters.yaml').read_text())
-    assert content['diver']['ros__parameters'] == {'origin': [59.5, 10.25, 0.0]}
-    DiverConfig.from_mapping(content['diver']['ros__parameters'])
-
-
-def test_metres_have_no_parameters(convert):
-    assert not (convert('time,x,y\n1,2,3\n').path / 'parameters.yaml').exists()
+def test_metres_have_no_parameters_and_the_same_input_gives_the_same_bag(convert, tmp_path):
+    text = 'stamp,x,y\n5,1,2\n6,2,3\n'
+    first = {file.name: file.read_bytes() for file in convert(text).path.iterdir()}
+    (tmp_path / 'out').rename(tmp_path / 'before')
+    second = {file.name: file.read_bytes() for file in convert(text).path.iterdir()}
+    assert first == second and 'parameters.yaml' not in first
+    with pytest.raises(BagError, match='exists already'):
+        convert(text)
 
 
 @pytest.mark.parametrize(
@@ -354,12 +285,211 @@ def test_advice_about_the_truth_names_the_options_of_the_truth(
     'stamp, words',
     [('10:{0:02d}:00', 'whole minutes. If'), ('10:00:{0:02d}', 'whole seconds. If')],
 )
-def test_rows_that_share_a_stamp_are_said(tmp_path, stamp, words):
+def test_rows_that_share_a_stamp_are_said(convert, tmp_path, stamp, words):
     rows = [f'2024-05-31T{stamp.format(k // 10)}Z,{k},{0.5 * k}' for k in range(60)]
-    (tmp_path / 'fixes.csv').write_text('\n'.join(['time,x,y', *rows]) + '\n')
-    report = convert_fixes(tmp_path / 'fixes.csv', tmp_path / 'bag')
-    said = report.notes['shared stamps']
+    said = convert('\n'.join(['time,x,y', *rows])).notes['shared stamps']
     assert 'up to 10 rows have one stamp' in said and words in said
+    (tmp_path / 'out').rename(tmp_path / 'before')
     one_each = [f'2024-05-31T10:{k:02d}:00Z,{k},1' for k in range(60)]
-    (tmp_path / 'fixes.csv').write_text('\n'.join(['time,x,y', *one_each]) + '\n')
-    assert 'shared stamps' not in convert_fixes(tmp_path / 'fixes.csv', tmp_path / 'b2').notes
+    assert 'shared stamps' not in convert('\n'.join(['time,x,y', *one_each])).notes
+
+
+# -- positions in GPX, KML and GeoJSON become what the same positions in a CSV become
+
+
+ROWS = [
+    ('anna', '2024-05-31T10:00:00Z', 54.1, 10.1, -3.0),
+    ('anna', '2024-05-31T10:00:05.250Z', 54.1001, 10.1, -3.5),
+    ('bert', '2024-05-31T12:00:01+02:00', 54.2, 10.2, -4.0),
+    ('bert', '2024-05-31T10:00:06Z', 54.2, 10.2001, -4.0),
+]
+
+
+def csv_text():
+    lines = [f'{time},{lat},{lon},{up},{name}' for name, time, lat, lon, up in ROWS]
+    return 'time,lat,lon,height,id\n' + '\n'.join(lines)
+
+
+def gpx_text():
+    points = [
+        f'<trkpt lat="{lat}" lon="{lon}"><ele>{up}</ele><time>{time}</time></trkpt>'
+        for _, time, lat, lon, up in ROWS
+    ]
+    return (
+        '<?xml version="1.0"?>\n<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1">'
+        f'<trk><name>anna</name><trkseg>{points[0]}</trkseg><trkseg>{points[1]}</trkseg></trk>'
+        f'<trk><name>bert</name><trkseg>{points[2]}{points[3]}</trkseg></trk></gpx>'
+    )
+
+
+def waypoints_text():
+    points = [
+        f'<wpt lat="{lat}" lon="{lon}"><ele>{up}</ele><time>{time}</time><name>{name}</name></wpt>'
+        for name, time, lat, lon, up in ROWS
+    ]
+    return f'<gpx xmlns="http://www.topografix.com/GPX/1/0">{"".join(points)}</gpx>'
+
+
+def kml_text():
+    tracks = []
+    for wanted in ('anna', 'bert'):
+        own = [row for row in ROWS if row[0] == wanted]
+        whens = ''.join(f'<when>{row[1]}</when>' for row in own)
+        coords = ''.join(f'<gx:coord>{row[3]} {row[2]} {row[4]}</gx:coord>' for row in own)
+        track = f'<gx:Track>{whens}{coords}</gx:Track>'
+        tracks.append(f'<Placemark><name>{wanted}</name>{track}</Placemark>')
+    return (
+        '<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2" '
+        'xmlns:gx="http://www.google.com/kml/ext/2.2"><Document><name>dive</name>'
+        f'{"".join(tracks)}</Document></kml>'
+    )
+
+
+def feature(kind, coordinates, **properties):
+    shape = {'type': kind, 'coordinates': coordinates}
+    return {'type': 'Feature', 'geometry': shape, 'properties': properties}
+
+
+def points_text():
+    features = [
+        feature('Point', [lon, lat, up], time=time, id=name, note=None)
+        for name, time, lat, lon, up in ROWS
+    ]
+    return json.dumps({'type': 'FeatureCollection', 'features': features})
+
+
+def lines_text():
+    features = []
+    for wanted in ('anna', 'bert'):
+        own = [row for row in ROWS if row[0] == wanted]
+        places, times = [[r[3], r[2], r[4]] for r in own], [row[1] for row in own]
+        features.append(feature('LineString', places, coordTimes=times, id=wanted))
+    return json.dumps({'features': features, 'type': 'FeatureCollection'})
+
+
+TEXTS = {
+    'a.gpx': gpx_text,
+    'b.gpx': waypoints_text,
+    'c.kml': kml_text,
+    'd.geojson': points_text,
+    'e.json': lines_text,
+}
+
+
+@pytest.mark.parametrize('name', TEXTS)
+def test_a_file_gives_the_fixes_of_a_csv(tmp_path, name):
+    found = []
+    for file, text in ((name, TEXTS[name]()), ('same.csv', csv_text())):
+        (tmp_path / file).write_text(text)
+        report = convert_fixes(tmp_path / file, tmp_path / f'{file}.bag', origin=(54.1, 10.1))
+        assert report.bad_rows == 0 and report.notes['id'] == 'anna is 1, bert is 2'
+        found.append(measured(report.path))
+    for first, other in zip(*found, strict=True):
+        assert first.stamp_ns == other.stamp_ns
+        assert first.position.tolist() == other.position.tolist()
+        assert list(first.target_id) == list(other.target_id)
+
+
+def test_truth_and_ignored_columns(tmp_path):
+    (tmp_path / 'a.gpx').write_text(gpx_text())
+    assert convert_truth(tmp_path / 'a.gpx', tmp_path / 'truth').messages == {'/truth/estimate': 4}
+    options = CsvOptions(ignore=['id'])
+    report = convert_fixes(tmp_path / 'a.gpx', tmp_path / 'out', options=options)
+    assert report.messages == {'/fix': 4} and 'id' in report.notes['ignored columns of a.gpx']
+
+
+@pytest.mark.parametrize(
+    'text, wanted',
+    [
+        ('<gpx><trk><trkseg><trkpt lat="1" lon="2">', 'damaged GPX'),
+        ('<gpx></gpx>', 'without a position'),
+        ('{"type": "FeatureCollection", "features": [', 'damaged JSON'),
+        ('{"type": "FeatureCollection", "features": [7, {"geometry": 3}]}', 'without a position'),
+        ('<gpx><wpt lat="54" lon="10"></wpt></gpx>', 'nothing that could be converted'),
+        ('<gpx><wpt lat="154" lon="10"><time>2024-05-31T10:00:00Z</time></wpt></gpx>',
+         'look exchanged'),
+        (f'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "{10 * "&a;"}"><!ENTITY c '
+         f'"{10 * "&b;"}">]><gpx><wpt lat="1" lon="1"><name>&c;</name></wpt></gpx>', 'GPX'),
+    ],
+)  # fmt: skip
+def test_damage_is_one_sentence(tmp_path, text, wanted):
+    (tmp_path / 'a.gpx').write_text(text)
+    with pytest.raises(BagError, match=wanted):
+        convert_fixes(tmp_path / 'a.gpx', tmp_path / 'out')
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.sampled_from(list(TEXTS)), st.integers(0, 700), st.binary(max_size=3), st.integers(0, 9))
+def test_hostile_bytes_are_no_tracebacks(tmp_path_factory, name, place, written, cut):
+    folder = tmp_path_factory.mktemp('track')
+    content = TEXTS[name]().encode()
+    content = content[:place] + written + content[place + cut :]
+    (folder / name).write_bytes(content)
+    try:
+        report = convert_fixes(folder / name, folder / 'out')
+    except BagError as error:
+        assert '\n' not in str(error)
+    else:
+        assert all(np.isfinite(fix.position).all() for fix in measured(report.path))
+
+
+def in_metres(name, count=30):
+    """GeoJSON of points in a map projection, and their latitudes and longitudes."""
+    east, north = 500_000.0 + 10.0 * np.arange(count), 5_983_000.0 + 7.0 * np.arange(count)
+    features = [
+        feature('Point', [east[k], north[k]], time=f'2024-05-31T10:00:{k:02d}Z')
+        for k in range(count)
+    ]
+    crs = {'type': 'name', 'properties': {'name': name}}
+    # Near the central meridian: the arc of the ellipsoid along it, and the circle across it.
+    axis, squared, scale = 6378137.0, 0.00669438, 0.9996
+
+    def radius(phi, power):
+        return axis / (1.0 - squared * np.sin(phi) ** 2) ** power
+
+    def arc(phi):
+        return scale * quad(lambda part: (1.0 - squared) * radius(part, 1.5), 0.0, phi)[0]
+
+    phi = np.array([brentq(lambda part, at=at: arc(part) - at, 0.9, 1.0) for at in north])
+    latitude = np.degrees(phi)
+    longitude = 9.0 + np.degrees((east - 500_000.0) / (scale * radius(phi, 0.5) * np.cos(phi)))
+    return {'type': 'FeatureCollection', 'crs': crs, 'features': features}, latitude, longitude
+
+
+@pytest.mark.parametrize(
+    'name, cut', [('urn:ogc:def:crs:EPSG::25832', False), ('EPSG:32632', True)]
+)
+def test_geojson_in_a_map_projection(tmp_path, name, cut):
+    whole, latitude, longitude = in_metres(name)
+    text = json.dumps(whole)
+    (tmp_path / 'dive.geojson').write_text(text[:-20] if cut else text)
+    origin = float(latitude[0]), float(longitude[0])
+    report = convert_fixes(tmp_path / 'dive.geojson', tmp_path / 'bag', origin=origin)
+    fixes = measured(report.path)
+    expected = pymap3d.geodetic2enu(latitude, longitude, 0.0, *origin, 0.0)
+    places = np.array([fix.position[:2] for fix in fixes])
+    assert len(places) == 30 - cut
+    assert places == pytest.approx(np.transpose(expected)[: 30 - cut, :2], abs=0.01)
+
+
+def test_geojson_in_a_system_that_is_not_known_is_one_sentence(tmp_path):
+    whole, _, _ = in_metres('our own grid')
+    (tmp_path / 'dive.geojson').write_text(json.dumps(whole))
+    with pytest.raises(BagError, match="'our own grid', which is not known"):
+        convert_fixes(tmp_path / 'dive.geojson', tmp_path / 'bag')
+
+
+@pytest.mark.parametrize('name, layer', [('a.gpx', 'track_points'), ('d.geojson', None)])
+def test_gdal_reads_the_same_places(tmp_path, name, layer):
+    pyogrio = pytest.importorskip('pyogrio')
+    path = tmp_path / name
+    path.write_text(TEXTS[name]())
+    _, _, geometry, _ = pyogrio.raw.read(path, layer=layer)
+    there = np.array([struct.unpack('<2d', each[5:21]) for each in geometry])
+    report = convert_truth(path, tmp_path / 'truth', origin=(54.0, 10.0))
+    assert report.rows == len(there) == 4
+    report = convert_fixes(path, tmp_path / 'bag', origin=(54.0, 10.0))
+    places = np.concatenate([scan.position[:, :2] for scan in measured(report.path)])
+    wanted = np.transpose(pymap3d.geodetic2enu(*there.T[::-1], 0.0, 54.0, 10.0, 0.0))[:, :2]
+    # As high as they are, they lie a little nearer.
+    assert sorted(places.tolist()) == pytest.approx(np.array(sorted(wanted.tolist())), abs=0.05)

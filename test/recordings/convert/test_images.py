@@ -11,16 +11,17 @@
 import json
 
 from helpers import marine
+from helpers.field_files import measured, pose_at
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_types_from_msg
 
-from msg_adapters.navigation import write_navigation
-from sonar_imm.measurements import Detections, Navigation, Rejection
+from msg_adapters.snapshots import FIELDS, snapshot_of_phase, snapshot_of_staves
+from msg_adapters.sonar_images import DTYPES
+from sonar_imm.measurements import Detections, Navigation, Rejection, Snapshot
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.recordings.measurements import measurements_of
-from sonar_imm_tools.recordings.messages import ros_message
-from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 BEARINGS = np.radians(np.linspace(20.0, -20.0, 41))
 
@@ -32,61 +33,33 @@ def image(second, row, spoilt=False):
     if row:
         samples[5, row] = 200.0
     payload = np.frombuffer(samples.astype('u1').tobytes(), np.uint8)
+    beams = np.column_stack([np.zeros(41), -np.sin(BEARINGS), np.cos(BEARINGS)])
     return marine.make(
-        'ProjectedSonarImage',
-        header=marine.header(sec=second),
-        ping_info=marine.ping_info(),
-        beam_directions=marine.vectors(
-            np.column_stack([np.zeros(41), -np.sin(BEARINGS), np.cos(BEARINGS)])
-        ),
-        ranges=marine.floats(2.0 + 0.5 * np.arange(100)),
+        'ProjectedSonarImage', header=marine.header(sec=second), ping_info=marine.ping_info(),
+        beam_directions=marine.vectors(beams), ranges=marine.floats(2.0 + 0.5 * np.arange(100)),
         image=marine.make(
-            'SonarImageData',
-            is_bigendian=False,
-            dtype=0,
-            beam_count=41,
+            'SonarImageData', is_bigendian=False, dtype=0, beam_count=41,
             data=payload[:-1] if spoilt else payload,
         ),
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture
 def bag(tmp_path):
-    path, types = tmp_path / 'survey', marine.typestore()
-    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
-        pictures = writer.add_connection(
-            '/fls/image', marine.PACKAGE + 'ProjectedSonarImage', typestore=types
-        )
-        poses = writer.add_connection('/auv/odometry', 'nav_msgs/msg/Odometry', typestore=types)
-        for second in range(1, 7):
-            message = image(second, 0 if second == 4 else 60 - second, spoilt=second == 6)
-            writer.write(
-                pictures, second * 10**9, types.serialize_cdr(message, message.__msgtype__)
-            )
-            pose = write_navigation(
-                Navigation(
-                    stamp_ns=second * 10**9, position=[0.5 * second, 0.0, -20.0],
-                    orientation=[0.0, 0.0, 0.0, 1.0], frame_id='odom',
-                ),
-                ros_message,
-            )  # fmt: skip
-            writer.write(poses, second * 10**9 + 1, types.serialize_cdr(pose, pose.__msgtype__))
-    return path
+    records = []
+    for k in range(1, 7):
+        picture = image(k, 0 if k == 4 else 60 - k, spoilt=k == 6)
+        records.append((k * 10**9, '/fls/image', picture))
+        records.append((k * 10**9 + 1, '/auv/odometry', pose_at(k * 10**9, 0.5 * k)))
+    return marine.write_bag(tmp_path / 'survey', records)
 
 
 def test_images_become_pings_also_empty_ones_and_navigation_comes_along(bag, tmp_path, capsys):
     out = tmp_path / 'detections'
-    assert (
-        main(
-            ['convert', 'images', str(bag), str(out), '--set', 'image_order=beam_major', '--json']
-        )
-        == 0
-    )
-    content = json.loads(capsys.readouterr().out)
+    content = converted('images', bag, out, '--set', 'image_order=beam_major', capsys=capsys)
     assert content['messages'] == {'/detections': 5, '/nav': 6} and content['bad_rows'] == 1
     assert '/fls/image #' in content['problems'][0]
-    with BagReader(out) as reader:
-        received = [item.measurement for item in measurements_of(reader, 'obstacle')]
+    received = measured(out, 'obstacle')
     assert not any(isinstance(item, Rejection) for item in received)
     pings = [item for item in received if isinstance(item, Detections)]
     assert [len(ping) for ping in pings] == [1, 1, 1, 0, 1]
@@ -107,65 +80,39 @@ def test_a_bag_without_images_and_a_wrong_setting_are_one_sentence(bag, tmp_path
     assert 'has no topic with' in error and len(error.splitlines()) == 1
 
 
-def write(path, messages):
-    """A bag with the messages of (topic, message, log time)."""
-    types = marine.typestore()
-    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
-        links = {}
-        for topic, message, log_ns in messages:
-            name = message.__msgtype__
-            if topic not in links:
-                links[topic] = writer.add_connection(topic, name, typestore=types)
-            writer.write(links[topic], log_ns, types.serialize_cdr(message, name))
-    return path
+def converted(kind, *arguments, capsys):
+    capsys.readouterr()
+    assert main(['convert', kind, *map(str, arguments), '--json']) == 0
+    return json.loads(capsys.readouterr().out)
 
 
 def oculus(second):
     rng = np.random.default_rng(second)
     samples = np.round(3.0 * np.sqrt(rng.exponential(size=(100, 41)))).astype('u1')
     samples[50, 30] = 200
-    return marine.make(
-        'oculus_interfaces/msg/Ping',
-        header=marine.header(sec=second),
-        **dict.fromkeys(('ping_id', 'ping_firing_date', 'master_mode'), 1),
-        **dict.fromkeys(('range', 'gain_percent', 'frequency', 'speed_of_sound_used'), 1.0),
-        **dict.fromkeys(('temperature', 'pressure'), 1.0),
-        range_resolution=0.5,
-        has_gains=False,
-        n_ranges=100,
-        n_beams=41,
-        step=41,
-        sample_size=1,
+    return marine.driver_message(
+        'oculus_interfaces/msg/Ping', header=marine.header(sec=second), range_resolution=0.5,
+        n_ranges=100, n_beams=41, step=41, sample_size=1, ping_data=samples.ravel(),
         bearings=np.linspace(-2000, 2000, 41).astype(np.int16),
-        ping_data=samples.ravel(),
-    )
+    )  # fmt: skip
 
 
 def ping360(angle, second):
     rng = np.random.default_rng([1, round(1000 * second)])
-    samples = 3.0 * np.sqrt(rng.exponential(size=200))
-    samples += (
-        200.0
-        * np.exp(-np.square((np.arange(200) - 100) / 2.0))
-        * (np.exp(-np.square((angle - 0.2) / 0.04)))
-    )
-    message = marine.make(
-        'ping360_sonar_msgs/msg/SonarEcho', header=marine.header(sec=int(second)),
-        angle=float(angle % (2.0 * np.pi)), gain=1, number_of_samples=200, transmit_frequency=740,
-        speed_of_sound=1500, range=20, intensities=np.minimum(samples, 255).astype('u1'),
+    seen = np.exp(-np.square((np.arange(200) - 100) / 2.0) - np.square((angle - 0.2) / 0.04))
+    samples = 3.0 * np.sqrt(rng.exponential(size=200)) + 200.0 * seen
+    return marine.driver_message(
+        'ping360_sonar_msgs/msg/SonarEcho', header=marine.header(sec=int(second)), range=20,
+        header__stamp__nanosec=round(second % 1.0 * 1e9), angle=float(angle % (2.0 * np.pi)),
+        intensities=np.minimum(samples, 255).astype('u1'),
     )  # fmt: skip
-    message.header.stamp.nanosec = round(second % 1.0 * 1e9)
-    return message
 
 
 def test_pings_of_an_oculus_in_a_bag_become_detections(tmp_path, capsys):
-    pings = [('/oculus/ping', oculus(k), k * 10**9) for k in range(1, 4)]
-    bag, out = write(tmp_path / 'bag', pings), tmp_path / 'out'
-    assert main(['convert', 'images', str(bag), str(out), '--json']) == 0
-    assert json.loads(capsys.readouterr().out)['messages'] == {'/detections': 3}
-    with BagReader(out) as reader:
-        found = [item.measurement for item in measurements_of(reader, 'obstacle')]
-    for ping in found:
+    pings = [(k * 10**9, '/oculus/ping', oculus(k)) for k in range(1, 4)]
+    bag, out = marine.write_bag(tmp_path / 'bag', pings), tmp_path / 'out'
+    assert converted('images', bag, out, capsys=capsys)['messages'] == {'/detections': 3}
+    for ping in measured(out, 'obstacle'):
         assert ping.range == pytest.approx([25.25], abs=0.1)
         assert ping.bearing == pytest.approx([-np.radians(10.0)], abs=0.01)
 
@@ -174,24 +121,21 @@ def test_directions_of_a_ping360_in_a_bag_are_gathered_into_sweeps(tmp_path, cap
     angles = np.arange(-0.6, 0.6, np.radians(1.8))
     scan = np.concatenate([angles, angles[-2::-1], angles[1:]])
     echoes = [
-        ('/scan_echo', ping360(angle, 10.0 + 0.1 * k), int((10.0 + 0.1 * k) * 1e9))
+        (int((10.0 + 0.1 * k) * 1e9), '/scan_echo', ping360(angle, 10.0 + 0.1 * k))
         for k, angle in enumerate(scan)
     ]
-    bag, out = write(tmp_path / 'bag', echoes), tmp_path / 'out'
+    bag, out = marine.write_bag(tmp_path / 'bag', echoes), tmp_path / 'out'
     settings = ['--set', 'beam_width_deg=2', '--set', 'range_resolution=0.4']
-    assert main(['convert', 'images', str(bag), str(out), *settings, '--json']) == 0
-    content = json.loads(capsys.readouterr().out)
+    content = converted('images', bag, out, *settings, capsys=capsys)
     assert content['messages'] == {'/detections': 2} and content['rows'] == len(scan)
-    with BagReader(out) as reader:
-        found = [item.measurement for item in measurements_of(reader, 'obstacle')]
-    for ping in found:
+    for ping in measured(out, 'obstacle'):
         assert ping.range == pytest.approx([10.1], abs=0.2)
         assert ping.bearing == pytest.approx([0.2], abs=0.02)
 
 
 def test_several_topics_of_images_have_to_be_chosen_from(tmp_path, capsys):
-    pings = [(f'/{side}/ping', oculus(1), 10**9) for side in ('port', 'starboard')]
-    bag = write(tmp_path / 'bag', pings)
+    pings = [(10**9, f'/{side}/ping', oculus(1)) for side in ('port', 'starboard')]
+    bag = marine.write_bag(tmp_path / 'bag', pings)
     assert main(['convert', 'images', str(bag), str(tmp_path / 'out')]) in (1, 2)
     assert '--topic /port/ping' in capsys.readouterr().err
     arguments = ['convert', 'images', str(bag), str(tmp_path / 'one'), '--topic']
@@ -208,12 +152,207 @@ def test_what_the_sonar_says_beside_its_images_is_used_from_its_message_on(tmp_p
         **dict.fromkeys(('pulse_lengths', 'bandwidths'), marine.floats([])),
         tx_signal_types=np.zeros(0, np.uint8),
     )
-    pings = [('/oculus/ping', oculus(k), k * 10**9) for k in range(1, 4)]
-    bag = write(tmp_path / 'bag', [*pings, ('/oculus/sonar_info', message, 25 * 10**8)])
-    with BagReader(bag) as reader:
-        received = [item.measurement for item in measurements_of(reader, 'obstacle')]
+    pings = [(k * 10**9, '/oculus/ping', oculus(k)) for k in range(1, 4)]
+    pings.append((25 * 10**8, '/oculus/sonar_info', message))
+    bag = marine.write_bag(tmp_path / 'bag', pings)
+    received = measured(bag, 'obstacle')
     strengths = [item.intensity[0] for item in received if isinstance(item, Detections)]
     assert strengths == pytest.approx([200.0, 200.0, np.sqrt(200.0)])
-    out = tmp_path / 'out'
-    assert main(['convert', 'images', str(bag), str(out), '--json']) == 0
-    assert json.loads(capsys.readouterr().out)['messages'] == {'/detections': 3}
+    done = converted('images', bag, tmp_path / 'out', capsys=capsys)
+    assert done['messages'] == {'/detections': 3}
+
+
+# -- arrays of few staves recorded as images: amplitude and phase, or one image a stave
+
+
+RATE, FIRST = 15_000.0, 400  # 0.05 m a bin, from 20 m on
+SCENE = scenario(
+    'paper',
+    {'pings': 2, 'staves': 2, 'spacing_wavelengths': 2.5, 'first_range': 20.0, 'last_range': 40.0},
+)
+SCENE_TRUTH = simulate(SCENE, 1)
+PINGS = [item.measurement for item in SCENE_TRUTH.measurements]
+
+
+def raw_image(ping, samples, dtype='f4', **raw):
+    """RawSonarImage of samples (ranges, channels), range-major."""
+    samples = np.atleast_2d(np.asarray(samples, '<' + dtype).T).T
+    data = np.frombuffer(np.ascontiguousarray(samples).tobytes(), np.uint8)
+    stamp = ping.stamp_ns
+    values = {'sample_rate': RATE, 'samples_per_beam': len(samples), 'sample0': FIRST, **raw}
+    values |= dict.fromkeys(('tx_delays', 'tx_angles', 'rx_angles'), marine.floats([]))
+    return marine.driver_message(
+        marine.PACKAGE + 'RawSonarImage', header__frame_id='sss', ping_info=marine.ping_info(),
+        header__stamp__sec=stamp // 10**9, header__stamp__nanosec=stamp % 10**9,
+        **{'image__dtype': DTYPES.index(dtype), 'image__data': data, **values},
+        image__beam_count=samples.shape[1],
+    )  # fmt: skip
+
+
+def phase_of(iq):
+    return np.angle(iq[:, 1] * iq[:, 0].conj())
+
+
+def in_two(stave):
+    return np.column_stack([stave.real, stave.imag])
+
+
+def test_complex_samples_come_back():
+    ping = PINGS[0]
+    made = snapshot_of_staves([raw_image(ping, in_two(ping.iq[:, p])) for p in range(2)])
+    assert np.array_equal(made.iq, ping.iq) and made.stamp_ns == ping.stamp_ns
+    assert made.range == pytest.approx(ping.range) and made.sample_rate == RATE
+    assert made.frequency == 450e3 and made.sound_speed == 1500.0 and made.frame_id == 'sss'
+    turns = [np.ascontiguousarray(ping.iq[:, p]).view(np.float32) for p in range(2)]
+    assert np.array_equal(
+        snapshot_of_staves([raw_image(ping, turn) for turn in turns]).iq, ping.iq
+    )
+
+
+@pytest.mark.parametrize('dtype, counts', [('f4', None), ('i2', 65536), ('u1', 256)])
+def test_amplitude_and_phase_of_two_staves(dtype, counts):
+    ping = PINGS[0]
+    phase = phase_of(ping.iq)
+    if counts:
+        phase = np.round(phase * counts / (2.0 * np.pi)) % counts
+        phase = np.where(phase >= counts / 2, phase - counts, phase) if dtype == 'i2' else phase
+    made = snapshot_of_phase(raw_image(ping, np.abs(ping.iq[:, 0])), raw_image(ping, phase, dtype))
+    step = 2.0 * np.pi / (counts or 1e6)
+    apart = np.angle(np.exp(1j * (phase_of(made.iq) - phase_of(ping.iq))))
+    assert np.abs(apart).max() < 0.51 * step + 1e-5
+    assert np.abs(made.iq[:, 0]) == pytest.approx(np.abs(ping.iq[:, 0]), rel=1e-6)
+    half = snapshot_of_phase(
+        raw_image(ping, np.abs(ping.iq[:, 0])),
+        raw_image(ping, phase, dtype),
+        radians_per_count=0.25,
+    )
+    assert np.angle(half.iq[5, 1]) == pytest.approx(
+        np.angle(np.exp(0.25j * float(phase[5]))), abs=1e-5
+    )
+
+
+def test_amplitude_and_phase_of_every_stave():
+    ping = PINGS[0]
+    made = snapshot_of_phase(raw_image(ping, np.abs(ping.iq)), raw_image(ping, np.angle(ping.iq)))
+    assert made.iq == pytest.approx(ping.iq, rel=1e-5, abs=1e-5)
+
+
+def ones(*shape, **raw):
+    return raw_image(PINGS[0], np.ones(shape), **raw)
+
+
+@pytest.mark.parametrize(
+    'make, images, word',
+    [
+        (snapshot_of_phase, (ones(9), ones(8)), 'do not fit'),
+        (snapshot_of_phase, (ones(9, sample_rate=0.0), ones(9)), 'sample rate'),
+        (snapshot_of_phase, (ones(9, 3), ones(9, 65)), 'too_large|channels'),
+        (snapshot_of_phase, (object(), ones(9)), "no field 'image'"),
+        (snapshot_of_phase, (ones(8, image__dtype=77), ones(8)), 'datatype 77'),
+        (snapshot_of_phase, (ones(8, image__data=ones(8).image.data[:-1]), ones(8)), ''),
+        (snapshot_of_staves, ([ones(8, 3), ones(8)],), 'two channels'),
+        (snapshot_of_staves, ([ones(8, 2), ones(7, 2)],), 'ranges'),
+    ],
+)
+def test_what_cannot_be_is_refused_with_a_sentence(make, images, word):
+    with pytest.raises(Rejection, match=word or None):
+        make(*images)
+
+
+# -- from bag to bag, and through the tracker -----------------------------------------------------
+
+
+def write(path, topics):
+    """A bag with messages by topic."""
+    return marine.write_bag(
+        path, [(k + 1, topic, each) for topic in topics for k, each in enumerate(topics[topic])]
+    )
+
+
+def snapshots_in(bag):
+    return [item for item in measured(bag, 'bathymetry') if isinstance(item, Snapshot)]
+
+
+def test_from_images_to_a_floor(tmp_path, capsys):
+    wide = write(
+        tmp_path / 'phase',
+        {
+            '/sss/a': [raw_image(p, np.abs(p.iq[:, 0])) for p in PINGS],
+            '/sss/p': [raw_image(p, phase_of(p.iq)) for p in reversed(PINGS)],
+        },
+    )
+    topics = ('--amplitude', '/sss/a', '--phase', '/sss/p', '--side', 'port')
+    report = converted('interferometer', wide, tmp_path / 'out', *topics, capsys=capsys)
+    assert report['messages'] == {'/port/snapshot': 2} and report['bad_rows'] == 0
+    found = sorted(snapshots_in(tmp_path / 'out'), key=lambda item: item.stamp_ns)
+    assert found[0].side == 'port'
+    spacing = SCENE.spacing_wavelengths
+    tracker = BathymetryTracker(
+        BathymetryConfig(element_spacing_wavelengths=spacing, noise_variance=1.0)
+    )
+    heights = np.array([tracker.process(snapshot)[0].state[:, 0] for snapshot in found])
+    error = heights - [item.height for item in SCENE_TRUTH.truth]
+    assert np.sqrt(np.mean(error**2)) < 0.15
+    assert tracker.counts['bins_silent'] < 0.1 * tracker.counts['bins']
+    staves = {
+        f'/stave_{p}': [raw_image(ping, in_two(ping.iq[:, p])) for ping in PINGS] for p in range(2)
+    }
+    bag, topics = write(tmp_path / 'iq', staves), ('--iq', '/stave_0', '--iq', '/stave_1')
+    converted('interferometer', bag, tmp_path / 'out2', *topics, capsys=capsys)
+    for found, ping in zip(snapshots_in(tmp_path / 'out2'), PINGS, strict=True):
+        assert np.array_equal(found.iq, ping.iq) and found.range == pytest.approx(ping.range)
+
+
+def test_navigation_comes_along_and_lonely_images_are_counted(tmp_path, capsys):
+    pings = [raw_image(p, np.ones(8)) for p in PINGS]
+    bag = write(tmp_path / 'bag', {'/a': pings, '/p': [ones(8)], '/odom': [pose_at(5, 0.0)]})
+    topics = ('--amplitude', '/a', '--phase', '/p')
+    report = converted('interferometer', bag, tmp_path / 'out', *topics, capsys=capsys)
+    assert report['messages'] == {'/snapshot': 1, '/nav': 1}
+    assert report['bad_rows'] == 1 and 'stamps have to be equal' in report['problems'][0]
+
+
+def test_fields_are_found_by_the_names_that_are_told(tmp_path, capsys):
+    """One message with both, of a type that nobody knows."""
+    types = marine.typestore()
+    name = 'my_msgs/msg/Sidescan'
+    types.register(
+        get_types_from_msg(
+            'std_msgs/Header header\nfloat32[] strength\nint16[] turn\nfloat32 fs\nfloat32 c', name
+        )
+    )
+    ping = PINGS[0]
+    counts = np.round(phase_of(ping.iq) / (2.0 * np.pi) * 65536).astype(np.int16)
+    message = types.types[name](
+        header=raw_image(ping, [1.0]).header, strength=np.abs(ping.iq[:, 0]).astype(np.float32),
+        turn=counts, fs=RATE, c=1480.0,
+    )  # fmt: skip
+    bag = write(tmp_path / 'bag', {'/sss': [message]})
+    names = {'amplitude': 'strength', 'phase': 'turn', 'sample_rate': 'fs', 'sound_speed': 'c'}
+    given = [part for pair in names.items() for part in ('--field', '='.join(pair))]
+    topics = ('--amplitude', '/sss', '--phase', '/sss')
+    converted('interferometer', bag, tmp_path / 'out', *topics, *given, capsys=capsys)
+    found = snapshots_in(tmp_path / 'out')[0]
+    assert phase_of(found.iq) == pytest.approx(phase_of(ping.iq), abs=2e-4)
+    assert found.sound_speed == 1480.0 and found.frequency is None and found.range[0] == 0.0
+    assert set(names) < set(FIELDS)
+
+
+@pytest.mark.parametrize(
+    'arguments, word',
+    [
+        (['--amplitude', '/a'], 'name the topics'),
+        ([], 'name the topics'),
+        (['--iq', '/a'], 'at least two staves'),
+        (['--iq', '/a', '--iq', '/nowhere'], "no topic '/nowhere'"),
+        (['--iq', '/a', '--iq', '/p', '--field', 'colour=x'], "unknown field 'colour'"),
+    ],
+)
+def test_mistakes_of_the_user_are_one_sentence(tmp_path, capsys, arguments, word):
+    bag = write(
+        tmp_path / 'bag', {name: [raw_image(PINGS[0], np.ones(8))] for name in ('/a', '/p')}
+    )
+    command = ['convert', 'interferometer', str(bag), str(tmp_path / 'out'), *arguments]
+    assert main(command) == 2
+    errors = capsys.readouterr().err
+    assert word in errors and errors.count('\n') == 1

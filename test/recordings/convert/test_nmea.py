@@ -12,6 +12,7 @@ from datetime import datetime, timedelta, timezone
 import math
 import shutil
 
+from helpers.field_files import checked, measured
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -20,7 +21,6 @@ import pytest
 
 from sonar_imm.acoustics.geometry import rotation_of_quaternion
 from sonar_imm_tools.recordings.convert import convert_nmea
-from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
 
@@ -70,13 +70,11 @@ def messages_of(path):
 
 
 def scans_of(path):
-    with BagReader(path) as bag:
-        return [item.measurement for item in measurements_of(bag, 'diver', {'/fixes': 'fixes'})]
+    return measured(path, topics={'/fixes': 'fixes'})
 
 
 def fixes_of(path):
-    with BagReader(path) as bag:
-        return [item.measurement for item in measurements_of(bag, 'diver', {'/fix': 'fix'})]
+    return measured(path, topics={'/fix': 'fix'})
 
 
 def ns(moment):
@@ -92,11 +90,8 @@ def test_vessel_and_targets_over_midnight(tmp_path):
             lines.append(ais(211_000_000 + k % 2, (54.01, 10.01), (moment.second - 3) % 60))
     report = converted(tmp_path, lines, origin=(*PLACE,))
     found = messages_of(report.path)
-    assert {topic: len(items) for topic, items in found.items()} == {
-        '/nav_fix': 20,
-        '/heading': 20,
-        '/fixes': 4,
-    }
+    counts = {topic: len(items) for topic, items in found.items()}
+    assert counts == {'/nav_fix': 20, '/heading': 20, '/fixes': 4}
     stamps = [item.header.stamp.sec for item in found['/nav_fix']]
     assert stamps == [ns(BEGIN) // 10**9 + k for k in range(20)]
     assert found['/nav_fix'][0].altitude == pytest.approx(42.0)  # above the ellipsoid
@@ -121,8 +116,7 @@ def test_without_targets_the_receiver_is_the_target(tmp_path):
 
 @pytest.mark.parametrize('reference, bearing', [('T', 120.0), ('R', 90.0)])
 def test_tracked_targets_are_placed_from_the_vessel(tmp_path, reference, bearing):
-    data = ('07', '0.5', f'{bearing}', reference, '3.0', '0.0', 'T', '', '', 'N', 'buoy', 'T', '')
-    tracked = str(pynmea2.TTM('RA', 'TTM', (*data, '235950.00', 'A')))
+    tracked = ttm(bearing, reference, 'buoy', '235950.00')
     lines = [position('RMC', BEGIN), heading(30.0), tracked]
     scan = scans_of(converted(tmp_path, lines, origin=PLACE).path)[0]
     reach, angle = 926.0, math.radians(120.0)
@@ -167,14 +161,6 @@ def test_what_cannot_be_used_is_counted_and_named(tmp_path):
     ]
 
 
-def test_a_date_can_be_told(tmp_path):
-    line = position('GGA', BEGIN)
-    with pytest.raises(BagError, match='--date'):
-        converted(tmp_path, [line])
-    report = converted(tmp_path, [line], date='2024-05-31')
-    assert messages_of(report.path)['/fix'][0].header.stamp.sec == ns(BEGIN) // 10**9
-
-
 @settings(max_examples=50, deadline=None)
 @given(
     st.lists(
@@ -186,11 +172,8 @@ def test_damaged_sentences_are_no_tracebacks(tmp_path_factory, changes):
     lines = [position('RMC', BEGIN), ais(211_000_001, (54.0, 10.0), 5), heading(3.0), 'x']
     for line, place, letter in changes:
         lines[line] = lines[line][:place] + letter + lines[line][place + 1 :]
-        body = lines[line].partition('*')[0]
-        checksum = 0
-        for character in body[1:].encode('ascii', 'replace'):
-            checksum ^= character
-        lines[line] = f'{body}*{checksum:02X}'  # the content is wrong, not the sum
+        body = lines[line].partition('*')[0].encode('ascii', 'replace').decode()
+        lines[line] = body[:1] + checked(body[1:])[1:]  # the content is wrong, not the sum
     folder = tmp_path_factory.mktemp('log')
     (folder / 'log.nmea').write_text('\n'.join(lines), encoding='utf-8')
     try:
@@ -201,17 +184,13 @@ def test_damaged_sentences_are_no_tracebacks(tmp_path_factory, changes):
         assert np.isfinite(report.rows)
 
 
-def summed(body):
-    return f'${body}*{pynmea2.NMEASentence.checksum(body):02X}'
-
-
 def usrth(distance, bearing, elevation=0.0):
-    return summed(f'USRTH,0,0,0,{distance},0,{bearing},{elevation},0,0,0,90.0,16')
+    return checked(f'USRTH,0,0,0,{distance},0,{bearing},{elevation},0,0,0,90.0,16')
 
 
 def psimssb(moment, ahead, starboard, status='A', system='C', turned='H', name='B01'):
     place = f'{starboard},{ahead},12.0,0.1'
-    return summed(f'PSIMSSB,{moment:%H%M%S}.00,{name},{status},,{system},{turned},M,{place},N,,')
+    return checked(f'PSIMSSB,{moment:%H%M%S}.00,{name},{status},,{system},{turned},M,{place},N,,')
 
 
 @pytest.mark.parametrize(
@@ -226,20 +205,16 @@ def test_targets_of_a_usbl_are_placed_from_the_vessel(tmp_path, sentence, east, 
     lines = [position('RMC', BEGIN), heading(90.0), sentence]
     report = converted(tmp_path, lines, origin=(*PLACE,))
     assert (report.messages['/nav_fix'], report.messages['/heading'], report.rows) == (1, 1, 3)
-    topic, kind = ('/fixes', 'fixes') if 'B01' in sentence else ('/fix', 'fix')
-    with BagReader(report.path) as bag:
-        (found,) = (item.measurement for item in measurements_of(bag, 'diver', {topic: kind}))
+    (found,) = (scans_of if 'B01' in sentence else fixes_of)(report.path)
     assert np.ravel(found.position) == pytest.approx([east, north, up], abs=0.05)
 
 
 def test_the_attitude_that_a_usbl_reports(tmp_path):
     """Bow up and starboard down, with the fraction of its second."""
     sensor = f'PSIMSNS,{BEGIN:%H%M%S}.250,M01,1,1,3.0,2.0,0.4,120.0,,1,0.0,,M01'
-    lines = [position('RMC', BEGIN), summed(sensor), psimssb(BEGIN, 10.0, 0.0)]
+    lines = [position('RMC', BEGIN), checked(sensor), psimssb(BEGIN, 10.0, 0.0)]
     report = converted(tmp_path, lines, origin=(*PLACE,))
-    with BagReader(report.path) as bag:
-        topics = {'/heading': 'heading'}
-        (found,) = (item.measurement for item in measurements_of(bag, 'diver', topics))
+    (found,) = measured(report.path, topics={'/heading': 'heading'})
     assert found.stamp_ns % 10**9 == 250_000_000
     bow, port = rotation_of_quaternion(found.orientation)[:, :2].T
     assert np.degrees(np.arctan2(bow[0], bow[1])) == pytest.approx(120.0)
@@ -250,7 +225,7 @@ def test_the_attitude_that_a_usbl_reports(tmp_path):
 @pytest.mark.parametrize(
     'sentence, words',
     [
-        (summed('PSIMSNS,095958.00,M01,1,1,3.0,2.0,0.4,,,1,0.0,,M01'), 'no heading'),
+        (checked('PSIMSNS,095958.00,M01,1,1,3.0,2.0,0.4,,,1,0.0,,M01'), 'no heading'),
         (psimssb(BEGIN, 1.0, 1.0, status='V'), 'flagged as invalid'),
         (psimssb(BEGIN, 1.0, 1.0, system='P'), 'coordinates P, H'),
         (psimssb(BEGIN, 1.0, 1.0, turned='N'), 'coordinates C, N'),
@@ -264,14 +239,14 @@ def test_a_vessel_with_a_usbl_is_never_the_target(tmp_path, sentence, words):
 
 @pytest.mark.parametrize('body', ['PSIMLBP,100000.00,B01,54.0,10.0', 'PTSAG,#1,100000.00,1,2'])
 def test_a_usbl_that_is_not_read_makes_the_vessel_no_target(tmp_path, body):
-    lines = [position('GGA', BEGIN), summed(body)]
+    lines = [position('GGA', BEGIN), checked(body)]
     with pytest.raises(BagError, match='is of a USBL and not read; --own fixes'):
         converted(tmp_path, lines, date='2024-05-31')
     assert converted(tmp_path, lines, date='2024-05-31', own='fixes').messages == {'/fix': 1}
 
 
 def test_sentences_that_are_not_known_are_counted_by_their_names(tmp_path):
-    lines = [position('RMC', BEGIN), summed('GPXYZ,1'), summed('PFOO,1,2')]
+    lines = [position('RMC', BEGIN), checked('GPXYZ,1'), checked('PFOO,1,2')]
     report = converted(tmp_path, lines)
     assert report.bad_rows == 0 and '1 GPXYZ' in report.notes['not used']
     assert '(' not in report.notes['not used']
@@ -281,25 +256,22 @@ def test_sentences_that_are_not_known_are_counted_by_their_names(tmp_path):
 def test_a_time_that_cannot_be_read_takes_no_other_stamp(tmp_path, clock):
     good = position('GGA', BEGIN)
     body = good[1:].rpartition('*')[0].split(',')
-    bad = summed(','.join([body[0], clock, *body[2:]]))
+    bad = checked(','.join([body[0], clock, *body[2:]]))
     report = converted(tmp_path, [good, bad, good], date='2024-05-31')
     assert (report.bad_rows, report.rows) == (1, 3)
     assert report.reasons == {'unreadable time': 1}
+    shutil.rmtree(report.path)
     with pytest.raises(BagError, match='cannot be read as HHMMSS') as caught:
-        convert_nmea_alone(tmp_path, bad)
+        converted(tmp_path, [bad] * 3, date='2024-05-31')
     assert '--date' not in caught.value.sentence
-
-
-def convert_nmea_alone(tmp_path, line):
-    (tmp_path / 'bad.nmea').write_text(f'{line}\r\n' * 3)
-    return convert_nmea(tmp_path / 'bad.nmea', tmp_path / 'none', date='2024-05-31')
 
 
 def test_the_date_is_advised_only_where_it_helps(tmp_path):
     times = [position('GGA', BEGIN)]
     with pytest.raises(BagError, match='--date'):
         converted(tmp_path, times)
-    assert converted(tmp_path, times, date='2024-05-31').messages == {'/fix': 1}
+    (fix,) = fixes_of(converted(tmp_path, times, date='2024-05-31').path)
+    assert fix.stamp_ns == ns(BEGIN)
     with pytest.raises(BagError, match='60 of 60 rows.*no time') as caught:
         converted(tmp_path, [ais(211_000_000, PLACE, 60)] * 60)
     assert '--date' not in caught.value.sentence
@@ -320,7 +292,7 @@ def by_talkers(apart, first='GP'):
             'GN': [talker(position(kind, moment, there), 'GN') for kind in ('RMC', 'GGA')],
         }
         for name in (first, 'GN' if first == 'GP' else 'GP'):
-            lines += [summed(body) for body in both[name]]
+            lines += [checked(body) for body in both[name]]
     return lines
 
 
@@ -362,7 +334,12 @@ def test_two_receivers_of_one_talker_are_a_question(tmp_path):
 )
 def test_headings_that_say_that_there_is_none_are_left_out(tmp_path, body):
     moment = BEGIN + timedelta(seconds=1)
-    lines = [position('RMC', BEGIN), summed('GPTHS,90.0,A'), position('RMC', moment), summed(body)]
+    lines = [
+        position('RMC', BEGIN),
+        checked('GPTHS,90.0,A'),
+        position('RMC', moment),
+        checked(body),
+    ]
     lines.append(ais(211, PLACE, 51))
     report = converted(tmp_path, lines)
     assert report.messages['/heading'] == 1 and report.bad_rows == 1
@@ -379,26 +356,28 @@ def test_times_before_sentences_of_another_zone_are_asked_about(tmp_path, hours)
         with pytest.raises(BagError, match=rf'are [+]?{hours} h from .* --time-zone'):
             converted(tmp_path, lines)
     report = converted(tmp_path, lines, time_zone=f'{hours:+03d}:00' if hours else '')
-    with BagReader(report.path) as bag:
-        stamps = [item.log_ns / 1e9 for item in bag.messages(['/fix'])]
-    assert stamps == [moment.timestamp() for moment in moments] and not report.questions
+    assert [fix.stamp_ns for fix in fixes_of(report.path)] == list(map(ns, moments))
+    assert not report.questions
     # Of AIS alone nobody says the time of day.
     lines = [f'2024-05-31 10:00:{k:02d} {ais(7, PLACE, 60)}' for k in range(5)]
     shutil.rmtree(report.path)
     assert '--time-zone' in converted(tmp_path, lines).questions[0]
 
 
+def ttm(bearing, reference, name, clock):
+    data = ('07', '0.5', f'{bearing}', reference, '3.0', '0.0', 'T', '', '', 'N', name, 'T', '')
+    return str(pynmea2.TTM('RA', 'TTM', (*data, clock, 'A')))
+
+
 def test_a_radar_without_heading_makes_the_vessel_no_target(tmp_path):
-    target = ('01', '1.0', '45.0', 'R', '0', '0', 'T', '0', '0', 'N', 'A', 'T', '', '', 'A')
-    lines = [position('RMC', BEGIN), str(pynmea2.TTM('RA', 'TTM', target))]
+    lines = [position('RMC', BEGIN), ttm(45.0, 'R', 'A', '')]
     with pytest.raises(BagError, match='no heading came before it'):
         converted(tmp_path, lines)
     assert converted(tmp_path, lines, own='fixes').messages == {'/fix': 1}
 
 
 def test_reports_of_the_own_ship_alone_are_named(tmp_path):
-    line = pyais.encode_dict(
-        {'type': 1, 'mmsi': 7, 'lat': 54.0, 'lon': 10.0, 'second': 60}, sentence_type='VDO'
-    )[0]
+    own = {'type': 1, 'mmsi': 7, 'lat': 54.0, 'lon': 10.0, 'second': 60}
+    line = pyais.encode_dict(own, sentence_type='VDO')[0]
     with pytest.raises(BagError, match='1 AIS reports of the own ship'):
         converted(tmp_path, [f'1700000000 {line}'])

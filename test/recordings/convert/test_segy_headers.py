@@ -10,13 +10,22 @@
 
 from datetime import datetime, timezone
 import struct
+import sys
 
+from helpers.field_files import measured
+from helpers.segy_files import write_segy
 import numpy as np
 import pytest
+import yaml
 
-from msg_adapters.array_records import read_trace
+from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.convert import convert_segy
+from sonar_imm_tools.recordings.convert.segy import (
+    doubted_spacing,
+    measured_instrument,
+)
+from sonar_imm_tools.recordings.positions import read_positions
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.segy_lines import read_segy
 from sonar_imm_tools.recordings.sniffing import sniff
@@ -91,8 +100,7 @@ def test_samples_of_every_format_in_either_order(tmp_path, code, order):
     assert sniff(tmp_path / 'line.sgy').kind == 'segy'
 
 
-@pytest.mark.parametrize('order', ['>', '<'])
-@pytest.mark.parametrize('code', [1, 2, 3, 5])
+@pytest.mark.parametrize('order, code', [('>', 1), ('<', 2), ('>', 3), ('<', 5)])
 def test_segyio_and_obspy_read_the_same_values(tmp_path, code, order):
     """In the formats that obspy has; those are all of revision 1 but one."""
     segy = pytest.importorskip('obspy.io.segy.segy')
@@ -148,21 +156,16 @@ def test_the_sample_interval_of_each_trace_or_of_the_file(tmp_path):
     line = read_segy(write(tmp_path / 'c.sgy', interval=[100, 100, 50], of_file={'interval': 80}))
     (question,) = line.questions
     assert '100 us in the trace headers and 80 us' in question and '0.8 times' in question
-    line = read_segy(write(tmp_path / 'b.sgy', interval=40_000))
+    line = read_segy(write(tmp_path / 'b.sgy', interval=40_000, of_file={'count': 0}))
     assert line.interval == pytest.approx(0.04)  # unsigned
-
-
-def test_the_number_of_samples_of_the_traces_where_the_file_states_none(tmp_path):
-    path = write(tmp_path / 'line.sgy', of_file={'count': 0})
-    assert read_segy(path).amplitude == pytest.approx(VALUES)
+    assert line.amplitude == pytest.approx(VALUES)  # their number by the traces
 
 
 def test_windows_that_shift_become_traces_of_other_depths(tmp_path):
     path = write(tmp_path / 'line.sgy', delay=[40, 40, 60], interval=[100, 100, 50])
     report = convert_segy(path, tmp_path / 'bag', depth_offset=1.0)
     assert '31 to 46 m' in report.notes['depth_of_sample_0']
-    with BagReader(tmp_path / 'bag') as bag:
-        depth = [read_trace(item.message).depth for item in bag.messages(['/trace'])]
+    depth = [trace.depth for trace in measured(tmp_path / 'bag', 'fathometer')]
     assert [each[0] for each in depth] == pytest.approx([31.0, 31.0, 46.0])
     assert [each[1] - each[0] for each in depth] == pytest.approx([0.075, 0.075, 0.0375], abs=1e-5)
 
@@ -223,23 +226,12 @@ def test_times_that_are_utc_or_of_gps(tmp_path, base):
     assert zone == (TEN - {0: 3600, 5: 18}.get(base, 0)) * 10**9
 
 
-@pytest.mark.parametrize(('year', 'whole'), [(21, 2021), (98, 1998)])
-def test_years_of_two_digits(tmp_path, year, whole):
-    line = read_segy(write(tmp_path / 'line.sgy', year=year))
-    assert line.stamps == read_segy(write(tmp_path / 'line.sgy', year=whole)).stamps
-
-
-def test_seconds_between_gps_and_utc():
-    moments = [
-        datetime(*date, tzinfo=timezone.utc).timestamp()
-        for date in (
-            (1980, 1, 6),
-            (1999, 1, 1),
-            (2012, 6, 30, 23, 59, 59),
-            (2012, 7, 1),
-            (2025, 1, 1),
-        )
-    ]
+def test_years_of_two_digits_and_seconds_between_gps_and_utc(tmp_path):
+    for year, whole in ((21, 2021), (98, 1998)):
+        line = read_segy(write(tmp_path / 'line.sgy', year=year))
+        assert line.stamps == read_segy(write(tmp_path / 'line.sgy', year=whole)).stamps
+    dates = (1980, 1, 6), (1999, 1, 1), (2012, 6, 30, 23, 59, 59), (2012, 7, 1), (2025, 1, 1)
+    moments = [datetime(*date, tzinfo=timezone.utc).timestamp() for date in dates]
     assert list(gps_minus_utc(np.array(moments))) == [0, 13, 15, 16, 18]
 
 
@@ -253,18 +245,26 @@ def test_traces_without_a_date_begin_when_the_user_says(tmp_path):
     line = read_segy(path, start='2021-03-01T10:00:00Z', rate=4.0)
     assert line.stamps == [TEN * 10**9 + k * 250_000_000 for k in range(3)]
     assert '--rate' in line.questions[0]
+    last = read_segy(write(path, year=2020, day=366)).stamps[0]
+    assert last == round(datetime(2020, 12, 31, 10, tzinfo=timezone.utc).timestamp()) * 10**9
+    write(path, year=[2020, 2021, 2021], day=366)
+    with pytest.raises(BagError, match='trace 2 is of day 366 of 2021, which is no date.*--start'):
+        read_segy(path)
+    line = read_segy(path, start='2021-03-01T10:00:00Z')
+    assert line.stamps[0] == TEN * 10**9 and 'day 366' in line.questions[0]
     # A time of day without a date goes on over midnight.
     path = write(tmp_path / 'night.sgy', year=0, day=0, hour=[23, 23, 0], minute=[58, 59, 0])
     line = read_segy(path, start='2021-03-01T10:00:00Z')
     assert line.stamps == [(TEN + 60 * k) * 10**9 for k in range(3)]
 
 
-@pytest.mark.parametrize('size', [0, 100, 3599, 3600, 3700])
+@pytest.mark.parametrize('size', [0, 14, 100, 3599, 3600, 3700])
 def test_a_file_without_a_whole_trace_is_one_sentence(tmp_path, size):
     path = write(tmp_path / 'line.sgy')
-    path.write_bytes(path.read_bytes()[:size])
-    with pytest.raises(BagError, match=r'cannot be read'):
-        read_segy(path)
+    path.write_bytes(path.read_bytes()[:size] if size != 14 else b'no traces here')
+    for name in ('line.sgy', 'absent.sgy'):
+        with pytest.raises(BagError, match=r'cannot be read'):
+            read_segy(tmp_path / name)
 
 
 @pytest.mark.parametrize('order', ['>', '<'])
@@ -281,10 +281,186 @@ def test_the_speed_of_sound_may_be_a_file_with_its_profile(tmp_path, capsys):
     profile.write_text('depth,sound_speed\n0,1480\n20,1480\n20.001,1520\n40.001,1520\n')
     asked = ['convert', 'segy', str(path), str(tmp_path / 'bag'), '--sound-speed']
     assert main([*asked, str(profile)]) == 0
-    with BagReader(tmp_path / 'bag') as bag:
-        message = next(bag.messages(['/trace'])).message
+    first = measured(tmp_path / 'bag', 'fathometer')[0]
     mean = 40.0 / (20.0 / 1480.0 + 20.0 / 1520.0)
-    assert read_trace(message).depth[0] == pytest.approx(0.5 * mean * 0.040, abs=2e-3)
+    assert first.depth[0] == pytest.approx(0.5 * mean * 0.040, abs=2e-3)
     for wrong, words in (('absent.svp', 'not a valid'), ('12', 'range'), (str(path), 'profile')):
         assert main([*asked[:3], str(tmp_path / 'no'), asked[4], wrong]) == 2
         assert words in capsys.readouterr().err
+
+
+# -- what traces tell of their instrument: pulse, noise, spacing and place
+
+
+T, N = 40, 90
+ARRIVAL = 30 + np.arange(T) // 8
+LAG = np.arange(N) - ARRIVAL[:, None]
+ECHO = 1000.0 * np.exp(-0.5 * np.square(LAG / 1.5)) + np.where(LAG > 6, 200.0, 0.0)
+
+
+def profile(path, amplitude, *, depth_m=0.0, arcsec=True):
+    second = np.arange(len(amplitude)) // 4
+    return write_segy(
+        path, amplitude, TRACE_SAMPLE_INTERVAL=66, YearDataRecorded=2018, DayOfYear=72,
+        HourOfDay=10, SecondOfMinute=second, ElevationScalar=-10,
+        SourceWaterDepth=round(10.0 * depth_m), SourceGroupScalar=-1000,
+        CoordinateUnits=2 if arcsec else 1, SourceX=round(-91.64 * 3.6e6) + 40 * second,
+        SourceY=round(17.13 * 3.6e6),
+    )  # fmt: skip
+
+
+def parameters_of(bag):
+    text = (bag / 'parameters.yaml').read_text()
+    return yaml.safe_load(text)['fathometer']['ros__parameters']
+
+
+def test_the_pulse_and_the_noise_are_measured():
+    pulse, noise = measured_instrument(ECHO, 0.4)
+    # A Gaussian of 1.5 samples: half of its width at half height, linear between samples.
+    assert pulse == pytest.approx(0.4 * 1.5, rel=0.1)
+    assert noise[:28] == pytest.approx(np.full(28, 1.0))
+    coarse = 100.0 * np.round(ECHO / 100.0)
+    assert measured_instrument(coarse, 0.4)[1][:28] == pytest.approx(np.full(28, 50.0))
+    assert measured_instrument(ECHO[:, 40:], 0.4) is None
+
+
+def test_an_impossible_spacing_is_said():
+    stated = np.full(T, 12.8)
+    assert doubted_spacing(ECHO, 0.4, 0.0, stated) is None
+    message = doubted_spacing(ECHO, 0.05, 0.0, stated)
+    assert '0.4 m a sample would fit' in message and '12.8 m of water' in message
+    # Samples that were left out before count as way.
+    assert doubted_spacing(ECHO[:, 10:], 0.4, 4.0, stated) is None
+    assert doubted_spacing(ECHO, 0.05, 0.0, np.zeros(T)) is None
+    assert 'end at 0.09 m' in doubted_spacing(ECHO, 0.001, 0.0, np.zeros(T))
+
+
+def test_an_envelope_brings_its_parameters_and_places(tmp_path):
+    path = profile(tmp_path / 'line.seg', ECHO, depth_m=12.8)
+    report = convert_segy(path, tmp_path / 'bag', stack=2)
+    assert 'would fit' in report.notes['sample_interval']
+    report = convert_segy(path, tmp_path / 'good', stack=2, sample_spacing=0.4)
+    assert 'sample_interval' not in report.notes
+    assert report.messages == {'/position': 10, '/trace': 20}
+    own = parameters_of(tmp_path / 'good')
+    assert own['pulse'] == 'gaussian' and own['pulse_width'] == pytest.approx(0.6, rel=0.05)
+    assert own['min_separation'] == pytest.approx(3 * own['pulse_width'])
+    with BagReader(tmp_path / 'good') as bag:
+        places = read_positions(bag)
+    assert places.latitude == pytest.approx(np.full(10, 17.13), abs=1e-6)
+    east, north = places.at(places.stamp_ns[:2] + np.array([500_000_000, -60 * 10**9]))
+    assert east[0] == pytest.approx(places.longitude[:2].mean(), abs=1e-9)
+    assert np.isnan(east[1]) and np.isnan(north[1])
+
+
+def test_what_is_no_envelope_is_left_alone(tmp_path):
+    path = profile(tmp_path / 'line.seg', ECHO - 100.0, arcsec=False)
+    report = convert_segy(path, tmp_path / 'bag', sample_spacing=0.4)
+    assert report.messages == {'/trace': 40} and 'pulse' not in report.notes
+    assert not (tmp_path / 'bag' / 'parameters.yaml').exists()
+    path = profile(tmp_path / 'deaf.seg', ECHO[:, 40:])
+    report = convert_segy(path, tmp_path / 'deaf', sample_spacing=0.4)
+    assert 'no floor stands free' in report.notes['pulse']
+
+
+def envelopes(*, gas=0.0, steep=0.0, growth=0.0, seed=1):
+    """Envelopes (400, 200), .1 m apart, of a pulse of .3 m on a floor that rises by `steep` m from
+    trace to trace, and falls; `gas`: share of arrivals that are up to six times as broad; noise of
+    .02 that grows by exp(growth)."""
+    rng, rows, z = np.random.default_rng(seed), np.arange(400), 0.1 * np.arange(200)
+    floor = 6.0 + 2.0 * np.sin(rows / 40.0) + steep * np.abs(rows % 20 - 10)
+    width = 0.3 * (1.0 + (rng.random(400) < gas) * rng.uniform(1.0, 5.0, 400))
+    away = z - floor[:, None]
+
+    def complex_noise(rms):
+        return rms * np.sqrt(0.5) * (rng.standard_normal((2, 400, 200)).T @ [1.0, 1j]).T
+
+    field = (
+        np.exp(-0.5 * np.square(away / width[:, None]))
+        * np.exp(2j * np.pi * rng.random(400))[:, None]
+    )
+    field = field + complex_noise(0.15) * np.where(away > 0.0, np.exp(-away / 3.0), 0.0)
+    return np.abs(field + complex_noise(0.02) * np.exp(growth * z / z[-1]))
+
+
+@pytest.mark.parametrize('field', [{}, {'gas': 0.8}, {'steep': 0.3}, {'gas': 0.5, 'steep': 0.3}])
+def test_scatter_and_slopes_do_not_widen_the_pulse(field):
+    """Gas makes most arrivals up to six times as broad: so is their median."""
+    pulse, _ = measured_instrument(envelopes(**field), 0.1)
+    gas = field.get('gas', 0.0)
+    assert 0.75 * 0.3 < pulse < (1.25 if not gas else 4.5) * 0.3
+
+
+def with_transmit_pulse(traces, samples=25):
+    """The first samples of each trace as an instrument has them, louder than any floor."""
+    ring = 3.0 * np.exp(-np.maximum(np.arange(traces.shape[1]) - samples, 0.0) / 2.0)
+    return traces + ring
+
+
+@pytest.mark.parametrize('ring', [False, True])
+def test_the_same_pulse_from_few_and_many_traces(ring):
+    """Not from what is loudest, which is the transmit pulse, whose end is much steeper or not."""
+    few, some = envelopes(seed=3)[:60], envelopes(seed=3)
+    many = np.concatenate([envelopes(seed=seed) for seed in range(3, 8)])
+    if ring:
+        few, some, many = map(with_transmit_pulse, (few, some, many))
+    pulses = [measured_instrument(each, 0.1)[0] for each in (few, some, many)]
+    assert pulses == pytest.approx([0.3] * 3, rel=0.2)
+    assert max(pulses) < 1.12 * min(pulses)
+
+
+def test_noise_that_grows_with_the_depth_is_measured():
+    true = 0.02 * np.exp(3.0 * np.linspace(0.0, 1.0, 200))
+    _, found = measured_instrument(envelopes(growth=3.0), 0.1)
+    # Just below the floor what scatters there cannot be told from it.
+    ratio = found / true
+    assert ratio.min() > 0.7 and np.delete(ratio, np.arange(40, 110)).max() < 1.45
+
+
+def test_traces_state_noise_that_grows(tmp_path):
+    profile(tmp_path / 'in.sgy', envelopes(growth=3.0))
+    report = convert_segy(tmp_path / 'in.sgy', tmp_path / 'out', sample_spacing=0.1)
+    assert 'growing with the depth' in report.notes['pulse']
+    assert parameters_of(tmp_path / 'out')['noise_sigma'] == 0.0
+    trace = measured(tmp_path / 'out', 'fathometer')[0]
+    assert trace.sigma[-1] > 10.0 * trace.sigma[0]
+
+
+def test_as_many_reflectors_as_the_window_holds():
+    """A pulse too broad for six reflectors in the window: fewer, and no run refused for that."""
+    broad = envelope_parameters(2.6, 0.1, 27.8)
+    assert broad['order_max'] == 3 and broad['order_max'] * broad['min_separation'] <= 27.8
+    assert envelope_parameters(0.5, 0.1, 27.8) == envelope_parameters(0.5, 0.1)
+    assert envelope_parameters(50.0, 0.1, 27.8)['order_max'] == 1
+
+
+LATE = np.arange(7)
+
+
+def test_segy_traces_have_their_depth_and_time_and_are_cut_and_stacked(tmp_path):
+    """Of seven traces every 100 us, four a second, of a recorder that starts late."""
+    line = write_segy(
+        tmp_path / 'line.seg', 100 * LATE[:, None] + np.arange(30), 3, YearDataRecorded=2018,
+        DayOfYear=72, HourOfDay=23, MinuteOfHour=11, SecondOfMinute=24 + LATE // 4,
+        TRACE_SAMPLE_INTERVAL=100, DelayRecordingTime=20,
+    )  # fmt: skip
+    report = convert_segy(line, tmp_path / 'bag', depth_offset=2.0)
+    traces = measured(tmp_path / 'bag', 'fathometer')
+    assert report.messages == {'/trace': 7}
+    assert np.allclose(traces[0].depth, 2.0 + 15.0 + 0.075 * np.arange(30), atol=1e-5)
+    assert list(traces[3].amplitude) == list(300.0 + np.arange(30))
+    start = 1520982684 * 10**9  # 2018-03-13 23:11:24 UTC
+    assert [trace.stamp_ns - start for trace in traces[:5]] == [k * 10**9 // 4 for k in range(5)]
+    how = {'sample_spacing': 0.376, 'first_sample': 12, 'samples': 8, 'stack': 3}
+    convert_segy(line, tmp_path / 'cut', **how)
+    traces = measured(tmp_path / 'cut', 'fathometer')
+    assert len(traces) == 2 and len(traces[0]) == 8
+    assert np.allclose(traces[0].depth[0], 15.0 + 12 * 0.376)
+    assert list(traces[1].amplitude) == list(400.0 + np.arange(12, 20))
+
+
+def test_without_segyio_the_command_says_how_to_get_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, 'segyio', None)
+    (tmp_path / 'line.seg').write_bytes(b'')
+    assert main(['convert', 'segy', str(tmp_path / 'line.seg'), str(tmp_path / 'bag')]) == 2
+    assert "pip install 'sonar_imm[segy]'" in capsys.readouterr().err

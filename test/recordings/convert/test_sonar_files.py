@@ -8,20 +8,23 @@
 
 """Files of sonars and folders of pictures as bags: what is taken, and what is said of bad ones."""
 
+import math
 import os
 import pickle
 import sys
 
+from helpers.field_files import measured
 from helpers.sonar_files import place_of, side_scan, xtf_head, xtf_ping, xtf_soundings
 import numpy as np
 import pytest
 import yaml
 
 from msg_adapters.soundings import read_ground
-from sonar_imm.measurements import Detections, Navigation, Snapshot
+from sonar_imm.measurements import Detections, Navigation, Rejection, Snapshot
 from sonar_imm_tools.recordings.conversion import ConversionReport
 from sonar_imm_tools.recordings.convert import convert_pictures, convert_xtf
-from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.convert import side_scan as convert_side_scan
+from sonar_imm_tools.recordings.convert_options import XtfOptions
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
@@ -29,11 +32,12 @@ from sonar_imm_tools.recordings.xtf import pings_of
 
 SIDES = [('port', 'port', 'uint16'), ('stbd', 'starboard', 'uint16')]
 
+TOWED = {'ShipYcoordinate': 54.0, 'ShipXcoordinate': 10.0, 'Layback': 25.0}
+TOO_FAR = 'up to 25 m behind'
+
 
 def read(bag, system, kind):
-    with BagReader(bag) as reader:
-        found = [item.measurement for item in measurements_of(reader, system)]
-    return [item for item in found if isinstance(item, kind)]
+    return [item for item in measured(bag, system) if isinstance(item, kind)]
 
 
 def echo(at, bins=500):
@@ -44,8 +48,11 @@ def echo(at, bins=500):
     return row.astype('u2')
 
 
-def xtf(path, pings, channels=SIDES):
-    path.write_bytes(b''.join([xtf_head(channels).to_bytes(), *pings]))
+def xtf(path, pings, channels=SIDES, **head):
+    start = xtf_head(channels)
+    for name, value in head.items():
+        setattr(start, name, value)
+    path.write_bytes(b''.join([start.to_bytes(), *pings]))
     return path
 
 
@@ -75,27 +82,29 @@ class TestXtf:
         assert nav.orientation == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=1e-9)
         assert pings[0].stamp_ns == 1_717_149_600 * 10**9
 
-    @pytest.mark.parametrize('order, at', [('far', 199), ('near', 300)])
-    def test_the_order_of_port_samples(self, tmp_path, order, at):
-        path = xtf(tmp_path / 'a.xtf', [xtf_ping(0.0, [echo(300), echo(-1)])])
-        convert_xtf(path, tmp_path / 'bag', side='port', port_samples=order)
+    @pytest.mark.parametrize(
+        'side, order, at, degrees',
+        [
+            ('port', 'far', 199, 90.0),
+            ('port', 'near', 300, 90.0),
+            ('starboard', 'far', 300, -90.0),
+        ],
+    )
+    def test_the_order_of_samples_and_the_narrow_high_beam_abeam(
+        self, tmp_path, side, order, at, degrees
+    ):
+        path = xtf(tmp_path / 'a.xtf', [xtf_ping(0.0, [echo(300), echo(300)])])
+        convert_xtf(path, tmp_path / 'bag', side=side, port_samples=order)
         (ping,) = read(tmp_path / 'bag', 'obstacle', Detections)
         assert ping.range == pytest.approx([(at + 0.5) * 0.1], abs=0.06)
-
-    @pytest.mark.parametrize('side, degrees', [('starboard', -90.0), ('port', 90.0)])
-    def test_the_narrow_high_beam_looks_abeam(self, tmp_path, side, degrees):
-        path = xtf(tmp_path / 'a.xtf', [xtf_ping(0.0, [echo(300), echo(300)])])
-        convert_xtf(path, tmp_path / 'bag', side=side)
         given = yaml.safe_load((tmp_path / 'bag' / 'parameters.yaml').read_text())
         (given,) = (each['ros__parameters'] for each in given.values())
         assert given['sonar_mount_rpy_deg'] == [0.0, 0.0, degrees]
         assert (given['horizontal_fov_deg'], given['vertical_fov_deg']) == (3.0, 80.0)
 
     def test_degrees_that_a_file_calls_metres_are_asked(self, tmp_path):
-        path = side_scan(tmp_path / 'a.xtf')
-        head = xtf_head(SIDES)
-        head.NavUnits = 0
-        path.write_bytes(head.to_bytes() + path.read_bytes()[1024:])
+        pings = side_scan(tmp_path / 'a.xtf').read_bytes()[1024:]
+        path = xtf(tmp_path / 'a.xtf', [pings], NavUnits=0)
         with pytest.raises(BagError, match='--units degrees'):
             convert_xtf(path, tmp_path / 'bag')
         convert_xtf(path, tmp_path / 'bag', units='degrees')
@@ -110,13 +119,11 @@ class TestXtf:
         [(3, 'its places are degrees, and they are'), (7, 'does not say the unit')],
     )
     def test_metres_that_a_file_calls_otherwise_are_asked(self, tmp_path, units, wanted):
-        head = xtf_head(SIDES)
-        head.NavUnits = units
         pings = [xtf_ping(0.2 * k, [echo(-1), echo(300)], (5e6, 4e5 + k)) for k in range(9)]
-        (tmp_path / 'a.xtf').write_bytes(b''.join([head.to_bytes(), *pings]))
+        path = xtf(tmp_path / 'a.xtf', pings, NavUnits=units)
         with pytest.raises(BagError, match=f'{wanted}.*400000, 5000000.*--units metres'):
-            convert_xtf(tmp_path / 'a.xtf', tmp_path / 'bag')
-        convert_xtf(tmp_path / 'a.xtf', tmp_path / 'bag', units='metres')
+            convert_xtf(path, tmp_path / 'bag')
+        convert_xtf(path, tmp_path / 'bag', units='metres')
         nav = read(tmp_path / 'bag', 'obstacle', Navigation)[-1]
         assert nav.position[:2] == pytest.approx([4e5 + 8.0, 5e6])
 
@@ -128,11 +135,9 @@ class TestXtf:
         assert convert_xtf(path, tmp_path / 'bag', side='port').messages['/detections'] == 3
 
     def test_metres_near_the_origin_are_no_question(self, tmp_path):
-        head = xtf_head(SIDES)
-        head.NavUnits = 0
         pings = [xtf_ping(0.2 * k, [echo(-1), echo(300)], (5.0, 0.1 * k)) for k in range(9)]
-        (tmp_path / 'a.xtf').write_bytes(b''.join([head.to_bytes(), *pings]))
-        assert not convert_xtf(tmp_path / 'a.xtf', tmp_path / 'bag').questions
+        path = xtf(tmp_path / 'a.xtf', pings, NavUnits=0)
+        assert not convert_xtf(path, tmp_path / 'bag').questions
 
     def test_the_frequency_of_several_channels_is_chosen(self, tmp_path):
         channels = [('low', 'starboard', 'uint16'), ('high', 'starboard', 'uint16')]
@@ -155,19 +160,10 @@ class TestXtf:
             ({'SensorHeading': 0.0}, echo(300), 'the heading is 0 in all 3 pings'),
             ({}, echo(-1), 'no echo was found in 3 pings of starboard'),
             ({}, np.maximum(echo(300), 65_535 * (np.arange(500) < 9)).astype('u2'), '1.8% of'),
-            (
-                {'SensorYcoordinate': 0.0, 'SensorXcoordinate': 0.0, 'ShipYcoordinate': 54.0,
-                 'ShipXcoordinate': 10.0, 'Layback': 25.0},
-                echo(300),
-                'up to 25 m behind',
-            ),
-            (
-                {'ShipYcoordinate': 54.0, 'ShipXcoordinate': 10.0, 'Layback': 25.0},
-                echo(300),
-                'up to 25 m behind',
-            ),
+            ({**TOWED, 'SensorYcoordinate': 0.0, 'SensorXcoordinate': 0.0}, echo(300), TOO_FAR),
+            (TOWED, echo(300), TOO_FAR),
         ],
-    )  # fmt: skip
+    )
     def test_what_looks_wrong_is_asked(self, tmp_path, more, row, words):
         pings = [xtf_ping(0.2 * k, [echo(-1), row], **more) for k in range(3)]
         report = convert_xtf(xtf(tmp_path / 'a.xtf', pings), tmp_path / 'bag')
@@ -221,12 +217,6 @@ class TestXtf:
         assert report.messages['/detections'] == 4
         assert report.problems == ['cut.xtf: a ping is cut off; what came before it is kept']
 
-    def test_a_packet_without_a_length_ends_the_file(self, tmp_path):
-        pings = some(3)
-        pings[2] = pings[2][:10] + bytes(4) + pings[2][14:]
-        report = convert_xtf(xtf(tmp_path / 'a.xtf', pings), tmp_path / 'bag')
-        assert report.messages['/detections'] == 2 and len(report.problems) == 1
-
     @pytest.mark.parametrize(
         'content, wanted',
         [
@@ -248,17 +238,14 @@ class TestXtf:
         assert report.messages['/nav'] == 1 and report.messages['/detections'] == 4
         assert any('3 pings have no position' in problem for problem in report.problems)
 
-    def test_a_clock_that_is_off_once_and_one_that_was_set(self, tmp_path):
+    def test_a_clock_that_is_off_once_one_that_was_set_and_a_ping_without_time(self, tmp_path):
         seconds = [0.0, 0.2, 1e8, 0.4, 0.6, 7200.0, 7200.2, 7200.4]
         pings = [xtf_ping(second, [echo(-1), echo(300)]) for second in seconds]
+        pings.append(xtf_ping(7200.6, [echo(-1), echo(3)], Month=13))
         report = convert_xtf(xtf(tmp_path / 'a.xtf', pings), tmp_path / 'bag')
-        assert report.messages['/detections'] == 7 and report.reasons == {'clock off': 1}
+        assert report.messages['/detections'] == 7
+        assert report.reasons == {'clock off': 1, 'no time': 1}
         assert any('jumps by 7199.4 s and stays' in problem for problem in report.problems)
-
-    def test_a_ping_without_a_time_is_counted(self, tmp_path):
-        pings = [*some(2), xtf_ping(0.4, [echo(-1), echo(3)], Month=13)]
-        report = convert_xtf(xtf(tmp_path / 'a.xtf', pings), tmp_path / 'bag')
-        assert report.reasons == {'no time': 1} and report.messages['/detections'] == 2
 
     def test_an_index_beside_the_file_is_not_unpickled(self, tmp_path):
         class Trap:
@@ -271,8 +258,7 @@ class TestXtf:
         assert not (tmp_path / 'sprung').exists()
 
     def test_it_reads_what_the_reader_of_the_library_reads(self, tmp_path):
-        import pyxtf
-
+        pyxtf = pytest.importorskip('pyxtf')
         path = side_scan(tmp_path / 'a.xtf')
         beams = [(-10.0, 2.0, 20.0), (10.0, -2.0, 21.0)]
         path.write_bytes(path.read_bytes() + xtf_soundings(12.0, beams))
@@ -309,18 +295,18 @@ class TestXtf:
             list(pings_of(tmp_path / 'a.xtf', report))
             assert len(report.problems) == 1 and '\n' not in report.problems[0]
 
-    @pytest.mark.parametrize('length', [0, 1, 13, 100, 255, (64 << 20) + 1, 3 << 30, 2**32 - 1])
     @pytest.mark.parametrize('kind', [0, 17, 6, 200])
-    def test_a_packet_that_states_another_length(self, tmp_path, kind, length):
+    def test_a_packet_that_states_another_length(self, tmp_path, kind):
         """Of 3 GB, in a file that has them, nothing is read."""
-        odd = bytearray(some(1)[0])
-        odd[2], odd[10:14] = kind, length.to_bytes(4, 'little')
-        path = xtf(tmp_path / 'a.xtf', [*some(2), bytes(odd)])
-        if length == 3 << 30:
-            os.truncate(path, path.stat().st_size + length)
-        report = ConversionReport(tmp_path)
-        assert len(list(pings_of(path, report))) == 2
-        assert len(report.problems) == 1 and 'kept' in report.problems[0]
+        for length in (0, 1, 13, 100, 255, (64 << 20) + 1, 3 << 30, 2**32 - 1):
+            odd = bytearray(some(1)[0])
+            odd[2], odd[10:14] = kind, length.to_bytes(4, 'little')
+            path = xtf(tmp_path / 'a.xtf', [*some(2), bytes(odd)])
+            if length == 3 << 30:
+                os.truncate(path, path.stat().st_size + length)
+            report = ConversionReport(tmp_path)
+            assert len(list(pings_of(path, report))) == 2, length
+            assert len(report.problems) == 1 and 'kept' in report.problems[0]
 
     def test_packets_of_other_types_are_passed_over(self, tmp_path):
         """The library breaks down at a serial port's, and knows nothing of the last one."""
@@ -331,16 +317,14 @@ class TestXtf:
         assert report.messages['/detections'] == 2 and not report.problems
         assert report.notes['packets not taken'] == '1 raw_serial, 1 250'
 
-    def test_a_ping_too_long_for_an_image_is_counted(self, tmp_path):
+    def test_a_ping_too_long_for_an_image_is_counted_and_a_pipe_is_not_waited_for(self, tmp_path):
         channels = [('stbd', 'starboard', 'uint8')]
         pings = [xtf_ping(0.2 * k, [np.zeros(n, 'u1')]) for k, n in enumerate([500, 4_000_001])]
         report = convert_xtf(xtf(tmp_path / 'a.xtf', pings, channels), tmp_path / 'bag')
         assert report.messages['/detections'] == 1 and report.reasons == {'too large': 1}
-
-    def test_a_pipe_is_not_waited_for(self, tmp_path):
-        os.mkfifo(tmp_path / 'a.xtf')
+        os.mkfifo(tmp_path / 'b.xtf')
         with pytest.raises(BagError, match='this is no file'):
-            convert_xtf(tmp_path / 'a.xtf', tmp_path / 'bag')
+            convert_xtf(tmp_path / 'b.xtf', tmp_path / 'none')
 
     def test_a_missing_library_is_named_with_its_extra(self, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, 'pyxtf', None)
@@ -395,3 +379,89 @@ def test_pictures_that_cannot_be_used_are_counted(tmp_path, folder):
     (folder / 'other.csv').write_text('file\n')
     with pytest.raises(BagError, match='2 CSV files; name the one'):
         convert_pictures(folder, tmp_path / 'none')
+
+
+# -- numbers of side scan: ranges, phases and what is said of a file, by hand
+
+
+PING = {'stamp_ns': 1, 'sound_speed': 1500.0, 'nav': None}
+
+
+def channel(samples=(1, 2, 3), **changes):
+    values = {'slant_range': 75.0, 'delay': 0.0, 'name': '', 'side': 'port', 'frequency': 4.55e5}
+    return {**values, 'samples': np.array(samples), **changes}
+
+
+@pytest.mark.parametrize(
+    'delay, near', [(0.0, 0.0), (0.01, 7.5), (9.99, 7492.5), (10.0, 0.0), (-1.0, 0.0)]
+)
+def test_a_sample_lies_in_the_middle_of_its_bin_and_the_delay_is_there_and_back(delay, near):
+    ranges = convert_side_scan._ranges(channel(delay=delay), 1500.0)
+    assert ranges == pytest.approx(near + np.array([12.5, 37.5, 62.5]))
+
+
+@pytest.mark.parametrize('far', [0.0, -1.0, math.nan, math.inf, 10_000.1])
+def test_a_slant_range_that_no_sonar_has_is_refused(far):
+    assert convert_side_scan._ranges(channel(slant_range=10_000.0), 1500.0)[-1] == pytest.approx(
+        8333.333
+    )
+    with pytest.raises(Rejection, match='slant range'):
+        convert_side_scan._ranges(channel(slant_range=far), 1500.0)
+
+
+@pytest.mark.parametrize(
+    'samples, radians_per_count, turn',
+    [
+        (np.array([16384], np.int16), None, 0.5 * math.pi),
+        (np.array([-16384], np.int16), None, -0.5 * math.pi),
+        (np.array([64], np.uint8), None, 0.5 * math.pi),
+        (np.array([0.25], np.float32), None, 0.25),
+        (np.array([8], np.int16), 0.125, 1.0),
+    ],
+)
+def test_the_range_of_whole_numbers_is_one_turn(samples, radians_per_count, turn):
+    assert convert_side_scan._turns(samples, radians_per_count) == pytest.approx([turn])
+
+
+def test_a_phase_is_that_of_stave_one_against_stave_zero():
+    channels = [channel([4, 4]), channel(np.array([0, 16384], np.int16), name='Phase')]
+    made = convert_side_scan._interferometer(PING, 'port', channels, XtfOptions())
+    assert made.iq == pytest.approx(np.array([[4.0, 4.0], [4.0, 4.0j]]), abs=1e-6)
+    assert made.sample_rate == pytest.approx(0.5 * 1500.0 / 37.5) and made.side == 'port'
+    assert convert_side_scan._interferometer(PING, 'port', channels[:1], XtfOptions()) is None
+
+
+@pytest.mark.parametrize('order, first', [('far', 3.0), ('near', 1.0)])
+def test_port_may_be_told_from_far_to_near(order, first):
+    ping = {'channels': [channel(), channel(side='starboard'), channel(side='', samples=[9])]}
+    found = convert_side_scan._sides(ping, order)
+    assert found['port'][0]['samples'][0] == first
+    assert found['starboard'][0]['samples'][0] == 1.0 and set(found) == {'port', 'starboard'}
+
+
+@pytest.mark.parametrize(
+    'clipped, top, full',
+    [(0, 32767, 0), (1, 32767, 1), (2, 32767, 2), (2, 4095, 2), (9, 4000, 0), (50, 15, 0)],
+)
+def test_more_than_a_hundredth_at_full_scale_is_said(clipped, top, full, tmp_path):
+    samples = np.ones(100, np.int16)
+    samples[:clipped] = top
+    how, report, channels = XtfOptions(), ConversionReport(tmp_path), [channel(samples)]
+    seen = convert_side_scan._Seen(how)
+    seen.image(convert_side_scan._image(PING, channels, how), channels, 1)
+    seen.tell(tmp_path / 'a.xtf', report)
+    assert seen.clipped == full and seen.samples == 100
+    assert any('full scale' in question for question in report.questions) == (full > 1)
+
+
+def test_samples_at_full_scale_are_those_of_the_frequency_that_is_used(tmp_path):
+    loud, calm = np.full(100, 32767, np.int16), np.ones(100, np.int16)
+    channels = [channel(loud, frequency=4e5), channel(calm, frequency=9e5)]
+    for frequency, clipped in ((None, 100), (4.1e5, 100), (8e5, 0)):
+        seen = convert_side_scan._Seen(XtfOptions(frequency=frequency))
+        image = convert_side_scan._image(PING, channels, seen.how)
+        seen.image(image, channels, 1)
+        assert seen.clipped == clipped and (image.amplitude.max() == 32767) == (clipped > 0)
+        report = ConversionReport(tmp_path)
+        seen.tell(tmp_path / 'a.xtf', report)
+        assert '--frequency HZ' in report.notes['frequencies']

@@ -109,6 +109,9 @@ def test_noise_near_an_array_that_hears_itself_is_louder_there_and_nowhere_else(
     assert (sigma[400:] == sigma[-1]).all() and sigma[-1] == pytest.approx(1.0, rel=0.1)
     flat = mirror_sigma(lambda *a: rng.standard_normal(a[2]), below, 0.05, 20.0, 2.5)
     assert (flat == flat[0]).all()
+    # Of a window that ends within the aperture no depth is left that could be louder.
+    short = mirror_sigma(ringing, 1.0 + 0.05 * np.arange(20), 0.05, 20.0, 2.5)
+    assert len(short) == 20 and (short == short[0]).all()
 
 
 @pytest.mark.parametrize('half, expected', [(np.inf, 3.3), (40.0, 1.0), (9.0, 1.0)])
