@@ -334,7 +334,7 @@ def hillshaded(chart: Chart, thin: int) -> go.Figure:
         math.sin(azimuth) * east - math.cos(azimuth) * down
     )
     shade = np.clip(light / np.sqrt(1.0 + np.square(east) + np.square(down)), 0.0, 1.0)
-    x, y = _axes(chart, thin)
+    x, y = chart.axes(thin)
     figure.add_heatmap(
         x=x,
         y=y,
@@ -364,7 +364,7 @@ def misties_figure(survey: Survey) -> go.Figure:
 
 
 def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str) -> go.Figure:
-    x, y = _axes(chart, thin)
+    x, y = chart.axes(thin)
     shown = values[::thin, ::thin].astype(np.float32)
     low, high = (-1.0, 1.0)
     if np.isfinite(shown).any():
@@ -380,13 +380,6 @@ def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str
     east = {'title': 'east [m]', 'constrain': 'domain', 'nticks': 5, **axis}
     north = {'title': 'north [m]', 'scaleanchor': 'x', **axis}
     return styled(figure, 560, east, north)
-
-
-def _axes(chart: Chart, thin: int) -> tuple[FloatArray, FloatArray]:
-    rows, columns = chart.shape
-    x = chart.west + chart.cell * (np.arange(columns)[::thin] + 0.5)
-    y = chart.north - chart.cell * (np.arange(rows)[::thin] + 0.5)
-    return np.asarray(x, np.float64), np.asarray(y, np.float64)
 
 
 def _summary(survey: Survey, chart: Chart) -> str:

@@ -33,23 +33,8 @@ CROSSING_SPEED = (0.5, 0.9)
 CLOSEST = 1.0
 MEETING = (0.46, 0.58)
 """When a pair is closest, in lengths of the scene."""
-
 MIDDLE = 20.0
 """Metres from the origin, on each axis, within which pairs meet."""
-
-CROSSING = (
-    'two pairs of divers that cross within a metre, scans of fixes in clutter',
-    {
-        'motion': 'crossing',
-        'sensor': 'scans',
-        'divers': 4,
-        'duration': 119.0,
-        'detection_probability': 0.9,
-        'fix_std': 0.7,
-        'clutter': 10.0,
-        'clutter_range': 80.0,
-    },
-)
 
 
 def crossing_paths(divers: int, times: FloatArray, rng: Generator) -> list[FloatArray]:
@@ -104,16 +89,6 @@ _HALF_NS = 500_000_000_000
 BEFORE_NS = 300_000_000
 """The pose is that much older than the scan."""
 POSITION_STD, HEADING_STD_DEG, ATTITUDE_STD_DEG = 0.3, 1.0, 0.3
-
-USBL = (
-    'divers with transponders, located from a vessel that circles them',
-    {'sensor': 'usbl', 'divers': 2, 'speed': 0.75, 'start': (0.0, 0.0), 'depth': (5.0, 15.0)},
-)
-GEODETIC = (
-    'fixes in latitude and longitude',
-    {'sensor': 'geodetic', 'speed': 0.75, 'random_rotation': True},
-)
-"""Scenes of `scenarios.SCENARIOS`."""
 
 
 def instruments_of_places(config: Any) -> dict[str, Any]:

@@ -33,16 +33,13 @@ from sonar_imm.truth import Received, Scene, TrueTrack
 
 from ..scenario import delay_ns, Scenario, Scenarios, stamps_of
 from .fixes import (
-    CROSSING,
     crossing_paths,
-    GEODETIC,
     instruments_of_places,
     instruments_of_scans,
     namespace_of,
     sense_from_vessel,
     sense_geodetic,
     sense_scan,
-    USBL,
 )
 
 MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still', 'crossing')
@@ -187,9 +184,14 @@ SCENARIOS: Scenarios = {
     'several': ('four divers, missed detections and clutter',
         {'divers': 4, 'detection_probability': 0.9, 'clutter': 2.0, 'random_rotation': True,
          'speed': 0.75}),
-    'crossing': CROSSING,
-    'usbl': USBL,
-    'geodetic': GEODETIC,
+    'crossing': ('two pairs of divers that cross within a metre, scans of fixes in clutter',
+        {'motion': 'crossing', 'sensor': 'scans', 'divers': 4, 'duration': 119.0,
+         'detection_probability': 0.9, 'fix_std': 0.7, 'clutter': 10.0, 'clutter_range': 80.0}),
+    'usbl': ('divers with transponders, located from a vessel that circles them',
+        {'sensor': 'usbl', 'divers': 2, 'speed': 0.75, 'start': (0.0, 0.0),
+         'depth': (5.0, 15.0)}),
+    'geodetic': ('fixes in latitude and longitude',
+        {'sensor': 'geodetic', 'speed': 0.75, 'random_rotation': True}),
 }
 # fmt: on
 """Name: (what it is, what differs from the defaults of `DiverScenario`)."""
