@@ -26,13 +26,13 @@ is the RMSE of the default over that of `heading_speed` alone.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from benchmarks.diver_families import INSIDE
+from benchmarks.diver_accuracy import INSIDE
 from benchmarks.study import final_estimates, first_track, Parts, study, truths
-from sonar_imm.estimation.arrays import BoolArray, FloatArray
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import TrueTrack
@@ -48,21 +48,6 @@ POOL = np.array(
 
 Places = Callable[[int, np.random.Generator], FloatArray]
 """Where receivers (k, 2) ask at a ping."""
-
-
-class Score(NamedTuple):
-    """Of the estimates of a run with a confirmed track."""
-
-    ping: FloatArray
-    """(K,) number of the ping."""
-    square: FloatArray
-    """(K,) squared error, m^2."""
-    nees: FloatArray
-    """(K,)."""
-
-    def only(self, kept: BoolArray) -> Score:
-        """The estimates `kept` (K,)."""
-        return Score(*(column[kept] for column in self))
 
 
 def path(seed: int, motion: str = 'legs', **values: Any) -> TrueTrack:
@@ -90,8 +75,9 @@ def transponder(stamp_ns: int, at: FloatArray, target: FloatArray, rng: Any) -> 
     )
 
 
-def followed(pings: list[Arrivals], track: TrueTrack, **values: Any) -> Score:
-    """Track a diver; estimates without a confirmed track are left out."""
+def followed(pings: list[Arrivals], track: TrueTrack, **values: Any) -> FloatArray:
+    """Number of the ping, squared error, m^2, and NEES (K, 3) of the estimates of a diver with a
+    confirmed track."""
     at = {int(stamp): k for k, stamp in enumerate(track.stamp_ns)}
     rows: list[tuple[float, float, float]] = []
     tracker = DiverTracker(DiverConfig(**values))
@@ -99,7 +85,7 @@ def followed(pings: list[Arrivals], track: TrueTrack, **values: Any) -> Score:
         if (found := first_track(estimate, track.position[at[stamp], :2])) is not None:
             error, nees = found
             rows.append((at[stamp], float(error @ error), nees))
-    return Score(*np.reshape(rows, (-1, 3)).T)
+    return np.reshape(rows, (-1, 3))
 
 
 # -- sides and single ranges ---------------------------------------------------------------------
@@ -152,24 +138,21 @@ def scene(name: str, seeds: range) -> dict[str, dict[str, float | None]]:
     return rows
 
 
-def row_of(scores: list[Score], first: int, last: int) -> dict[str, float | None]:
+def row_of(scores: list[FloatArray], first: int, last: int) -> dict[str, float | None]:
     """The numbers of the pings from `first` to before `last`."""
-    parts = []
-    for score in scores:
-        inside = (score.ping >= first) & (score.ping < last)
-        parts.append(score.only(inside))
-    shown = [part for part in parts if len(part.ping)]
+    parts = [score[(score[:, 0] >= first) & (score[:, 0] < last)] for score in scores]
+    shown = [part for part in parts if len(part)]
     row: dict[str, float | None] = {'tracked': len(shown) / len(scores)}
     if not shown:
         return row
-    square, nees = (np.concatenate([part[k] for part in shown]) for k in (1, 2))
+    _, square, nees = np.concatenate(shown).T
     return row | {
         'RMSE': float(np.sqrt(square.mean())),
         'median': float(np.sqrt(np.median(square))),
         'NEES': float(nees.mean()),
         'inside': float((nees < INSIDE).mean()),
-        'sure and wrong': float(np.mean([(part.nees > WRONG).mean() > 0.2 for part in shown])),
-        'begins s': float(np.median([score.ping[0] for score in scores if len(score.ping)])),
+        'sure and wrong': float(np.mean([(part[:, 2] > WRONG).mean() > 0.2 for part in shown])),
+        'begins s': float(np.median([score[0, 0] for score in scores if len(score)])),
     }
 
 
@@ -212,18 +195,16 @@ def thinned(seed: int, receivers: int, passive: bool, track: TrueTrack) -> list[
 def few(kind: str, receivers: int, seeds: range) -> dict[str, float]:
     """The default and `heading_speed` alone."""
     passive, values = KINDS[kind]
-    late: dict[str, list[Score]] = {'families': [], 'heading_speed': []}
+    late: dict[str, list[FloatArray]] = {'families': [], 'heading_speed': []}
     for seed in seeds:
         track = path(seed, **values)
         pings = thinned(seed, receivers, passive, track)
         for model_set, scores in late.items():
             score = followed(pings, track, max_tracks=1, model_set=model_set)
-            scores.append(score.only(score.ping >= SETTLED))
-    square, nees = (
-        {name: np.concatenate([score[k] for score in scores]) for name, scores in late.items()}
-        for k in (1, 2)
-    )
-    rmse = {name: float(np.sqrt(each.mean())) for name, each in square.items()}
+            scores.append(score[score[:, 0] >= SETTLED])
+    columns = {name: np.concatenate(scores).T for name, scores in late.items()}
+    nees = {name: each[2] for name, each in columns.items()}
+    rmse = {name: float(np.sqrt(each[1].mean())) for name, each in columns.items()}
     return {
         'RMSE': rmse['families'],
         'heading_speed': rmse['heading_speed'],

@@ -46,7 +46,7 @@ import zlib
 
 import numpy as np
 
-from benchmarks.diver_families import INSIDE, integrated, legs, smooth_turns
+from benchmarks.diver_accuracy import INSIDE, integrated, legs, smooth_turns
 from benchmarks.study import first_track, mean_of, Parts, study
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.consistency import gospa

@@ -195,13 +195,10 @@ def write_json(
 def added(before: Mapping[str, str], now: Mapping[str, str]) -> dict[str, str]:
     """How a file was made that was there and was added to: day and commit are those of the first
     command, each other one says its commit."""
-    others = [
-        each for each in before['command'].split('; ') if not each.startswith(now['command'])
-    ]
-    return {
-        **before,
-        'command': '; '.join([*others, f'{now["command"]} at commit {now["commit"]}']),
-    }
+    first, *others = before['command'].split('; ')
+    kept = [each for each in others if each.partition(' at commit ')[0] != now['command']]
+    again = f'{now["command"]} at commit {now["commit"]}'
+    return {**before, 'command': '; '.join([first, *kept, again])}
 
 
 def known(path: Path | None) -> dict[str, Any]:

@@ -38,7 +38,6 @@ from pathlib import Path
 import shutil
 import sys
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from attrs import frozen
 import numpy as np
@@ -53,9 +52,6 @@ from sonar_imm_tools.recordings.own_files import write_own_limit
 
 SHARE = 0.9
 """Of the runs that are within the limit of `check`."""
-
-SHOWN = ('of the seed', 'median', '5 %', '95 %')
-"""Columns of README.md; the command prints all."""
 
 
 @frozen
@@ -93,18 +89,10 @@ def typical(runs: Runs, metrics: Sequence[str], keep: int | None = None) -> Typi
     spread = {}
     for name, column in zip(metrics, error.T):
         finite = column[np.isfinite(column)]
-        low, middle, upper, share, high = np.percentile(finite, [5, 50, 75, 100 * SHARE, 95])
-        spread[name] = {
-            'of the seed': float(column[best]),
-            'median': float(middle),
-            '5 %': float(low),
-            '75 %': float(upper),
-            f'{100 * SHARE:.0f} %': float(share),
-            '95 %': float(high),
-            'worst': float(finite.max()),
-            'runs': float(len(finite)),
-        }
-    limit = rounded_up(spread[metrics[0]][f'{100 * SHARE:.0f} %'])
+        columns = [column[best], *np.percentile(finite, [50, 5, 95])]
+        spread[name] = dict(zip(('of the seed', 'median', '5 %', '95 %'), map(float, columns)))
+    first = error[:, 0]
+    limit = rounded_up(float(np.percentile(first[np.isfinite(first)], 100 * SHARE)))
     return Typical(seeds[best], int(rank[best, 0]) + 1, limit, spread)
 
 
@@ -140,9 +128,6 @@ def readme(given: argparse.Namespace, found: Typical, limit: Limit, failed: int)
     again += [] if given.keep is None else ['--keep', str(given.keep)]
     first = next(iter(found.spread))
     what = limit.meaning if first == limit.metric else f'`{first}`'
-    shown = {
-        metric: {column: row[column] for column in SHOWN} for metric, row in found.spread.items()
-    }
     return '\n'.join(
         [
             f'# {name}',
@@ -154,7 +139,7 @@ def readme(given: argparse.Namespace, found: Typical, limit: Limit, failed: int)
             f'`sonar-imm check {given.system}` allows {found.limit:g} {limit.unit}; '
             f'{100 * SHARE:.0f} % of these runs stay below.',
             '',
-            markdown(shown),
+            markdown(found.spread),
             '',
             f'    {" ".join(again)}',
             '',
@@ -173,15 +158,11 @@ def scored(system: str, scene: Sequence[str]) -> dict[str, float]:
         ):
             if sonar_imm([*words]):
                 return {}
-        return finite_numbers(json.loads(Path(run, 'metrics.json').read_text(encoding='utf-8')))
-
-
-def finite_numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Return the finite numbers among nested metrics by dotted name; True is 1."""
+        metrics = flatten(json.loads(Path(run, 'metrics.json').read_text(encoding='utf-8')))
     return {
         name: float(value)
-        for name, value in flatten(metrics).items()
-        if isinstance(value, (bool, int, float)) and math.isfinite(value)
+        for name, value in metrics.items()
+        if isinstance(value, (int, float)) and math.isfinite(value)
     }
 
 

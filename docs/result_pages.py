@@ -11,7 +11,7 @@
 Whole pages: ``docs/templates/NAME.md.j2`` makes ``docs/results/NAME.md``. Single tables in pages
 written by hand: ``docs/templates/tables/NAME.md.j2`` replaces the table with the same head.
 Templates take numbers by path, names joined by `>`: the first is the file below docs/results, the
-others lead to the number, as in ``diver_families>paths>legs, 1 m, 1>raw``.
+others lead to the number, as in ``diver_accuracy>paths>legs, 1 m, 1>raw``.
 """
 
 from __future__ import annotations
@@ -74,9 +74,11 @@ class Numbers:
         return format(value, usual if spec is None else spec).replace('%', ' %')
 
     def made(self, file: str) -> str:
-        """Return a link to a file with the day and the commit of its numbers."""
+        """Return a link to a file with the day and the commits of its numbers."""
         made = self.at(f'{file}>made')
-        return f'[{file}.json]({file}.json), {made["date"]}, {made["commit"]}'
+        added = re.findall(r' at commit (\w+)', made['command'])
+        commits = ', '.join(dict.fromkeys([made['commit'], *added]))
+        return f'[{file}.json]({file}.json), {made["date"]}, {commits}'
 
     def table(
         self,
@@ -140,18 +142,6 @@ class Numbers:
         self.captioned |= set(files)
         return f'{text}\n\n<small>{"; ".join(map(self.made, files))}</small>'
 
-    def has(self, path: str) -> bool:
-        """Return whether there is something at a path, for what only some files hold."""
-        try:
-            self.at(path)
-        except (LookupError, FileNotFoundError):
-            return False
-        return True
-
-    def keys(self, path: str, part: str = '') -> list[str]:
-        """Return the names at a path that contain `part`; none where the path leads nowhere."""
-        return [name for name in self.at(path) if part in name] if self.has(path) else []
-
     def sources(self) -> str:
         """Return one line with the files that were read and stand below no table; "" for none."""
         others = '; '.join(map(self.made, sorted(self.files.keys() - self.captioned)))
@@ -164,9 +154,7 @@ def rendered(template: Path, folder: Path = RESULTS) -> str:
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     numbers = Numbers(folder)
-    functions = {
-        name: getattr(numbers, name) for name in ('n', 'table', 'has', 'keys', 'made', 'sources')
-    }
+    functions = {name: getattr(numbers, name) for name in ('n', 'table', 'made', 'sources')}
     text = environment.from_string(template.read_text(encoding='utf-8')).render(functions)
     return text.rstrip() + '\n'
 

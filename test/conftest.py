@@ -30,7 +30,7 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
 os.environ.pop('ROS_LOCALHOST_ONLY', None)
 
 # Without ROS the rest of the package is still tested, e.g. on the oldest numpy.
-without_ros = ['conformance/nodes', 'nodes', 'replay', 'system']
+without_ros = ['nodes', 'replay', 'system']
 collect_ignore = [] if importlib.util.find_spec('rclpy') else without_ros
 
 

@@ -11,7 +11,6 @@
 import ast
 import json
 import os
-from pathlib import Path
 import re
 import subprocess
 import sys
@@ -40,15 +39,12 @@ def test_there_is_one_for_each_system():
 
 
 @pytest.mark.parametrize('path', EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_runs_without_ros_and_writes_a_plot(path: Path, tmp_path):
+def test_an_example_runs_without_ros_and_writes_a_plot(path, tmp_path):
     done = subprocess.run(
         [sys.executable, '-c', WITHOUT_ROS.replace('sys.argv[1]', repr(str(path)))],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        env=dict(os.environ, PYTHONPATH=str(ROOT)),
+        capture_output=True, text=True, cwd=tmp_path, env=dict(os.environ, PYTHONPATH=str(ROOT)),
         timeout=600,
-    )
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.count('\n') == 1 and any(letter.isdigit() for letter in done.stdout)
     page = (tmp_path / f'{path.stem}.html').read_text(encoding='utf-8')
@@ -56,20 +52,20 @@ def test_an_example_runs_without_ros_and_writes_a_plot(path: Path, tmp_path):
 
 
 @pytest.mark.parametrize('path', EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_is_short(path: Path):
+def test_an_example_is_short(path):
     text = path.read_text(encoding='utf-8')
     (_, *code) = ast.parse(text).body
     lines = text.splitlines()[code[0].lineno - 1 :]
     assert sum(bool(line.strip()) for line in lines) <= MOST_LINES
 
 
-def cells(path: Path, kind: str) -> list[str]:
+def cells(path, kind):
     book = json.loads(path.read_text(encoding='utf-8'))
     return [''.join(cell['source']) for cell in book['cells'] if cell['cell_type'] == kind]
 
 
 @pytest.mark.parametrize('path', NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs_and_the_site_shows_what_it_gives(path: Path, monkeypatch):
+def test_a_notebook_runs_and_the_site_shows_what_it_gives(path, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / 'docs'))
     import site_pages
 

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Files and folders are whole or not there."""
+"""Files and folders are whole or not there; shared ones are found, those of this installation."""
 
 import os
 from pathlib import Path
@@ -19,6 +19,7 @@ import pytest
 
 from sonar_imm import files
 from sonar_imm.files import beside, fcntl, hold, UNFINISHED, whole
+from sonar_imm_tools.resources import share_folder, shared_file
 
 locks = pytest.mark.skipif(fcntl is None, reason='there are no locks')
 
@@ -188,3 +189,62 @@ def test_who_waits_for_a_folder_goes_on_when_it_is_free_or_patience_ends(tmp_pat
             assert time.monotonic() - begun >= 0.1
     with files.one_at_a_time(tmp_path, 60.0), files.one_at_a_time(tmp_path / 'nowhere', 60.0):
         assert time.monotonic() - begun < 30.0
+
+
+# -- shared files are found after every kind of installation --
+
+
+def touch(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    return path
+
+
+@pytest.mark.parametrize(
+    'place',
+    [
+        'lib/python3.12/site-packages',  # pip in a venv, colcon
+        'lib/python3.12/dist-packages',  # Debian's Python
+        'local/lib/python3.12/dist-packages',  # the same, colcon on Ubuntu
+        '.',  # pip install --target
+    ],
+)
+def test_installed_files_lie_in_share_of_the_prefix(tmp_path, place):
+    module = touch(tmp_path / place / 'sonar_imm' / 'resources.py')
+    touch(tmp_path / 'share' / 'sonar_imm' / 'package.xml')
+    assert share_folder(module) == tmp_path / 'share' / 'sonar_imm'
+
+
+def test_source_tree_is_its_own_share(tmp_path):
+    module = touch(tmp_path / 'ws' / 'src' / 'sonar_imm' / 'sonar_imm' / 'resources.py')
+    root = module.parents[1]
+    touch(root / 'setup.py')
+    touch(root / 'resource' / 'sonar_imm')
+    # An older version installed above the workspace does not matter.
+    touch(tmp_path / 'share' / 'sonar_imm' / 'package.xml')
+    assert share_folder(module) == root
+
+
+def test_links_of_a_symlink_install_lead_to_the_source(tmp_path):
+    module = touch(tmp_path / 'src' / 'sonar_imm' / 'resources.py')
+    touch(tmp_path / 'src' / 'setup.py')
+    touch(tmp_path / 'src' / 'resource' / 'sonar_imm')
+    link = tmp_path / 'build' / 'sonar_imm'
+    link.parent.mkdir()
+    link.symlink_to(module.parent, target_is_directory=True)
+    assert share_folder(link / 'resources.py') == tmp_path / 'src'
+
+
+def test_a_copied_module_says_what_is_missing(tmp_path):
+    module = touch(tmp_path / 'sonar_imm' / 'resources.py')
+    with pytest.raises(FileNotFoundError, match='install the package with pip or colcon'):
+        share_folder(module)
+
+
+def test_the_default_parameters_are_shared():
+    assert 'ros__parameters' in shared_file('config/diver.yaml').read_text(encoding='utf-8')
+
+
+def test_an_unknown_shared_file_is_named():
+    with pytest.raises(FileNotFoundError, match="no shared file 'bags/nothing'"):
+        shared_file('bags/nothing')

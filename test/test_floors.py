@@ -6,13 +6,15 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Imports go down the floors of docs/architecture.md only, and never in a circle."""
+"""Imports go down the floors of docs/architecture.md only, and never in a circle; nothing that
+came from a file or a process is run; and the examples in docstrings do what they say."""
 
 from __future__ import annotations
 
 import ast
+import doctest
 from functools import partial
-from pathlib import Path
+from importlib import import_module
 import subprocess
 import sys
 
@@ -25,6 +27,7 @@ from helpers.source import (
     MODULES,
     ROOT,
     ROS_MODULES,
+    tree_of,
 )
 import pytest
 
@@ -33,31 +36,15 @@ if not (ROOT / 'setup.py').is_file():
 
 # A room may import from its own floor and from lower ones.
 FLOORS = {
-    'sonar_imm.files': 0,
-    'sonar_imm.gone': 0,
-    'sonar_imm.texts': 0,
-    'sonar_imm.threads': 0,
-    'sonar_imm.estimation': 0,
-    'sonar_imm.acoustics': 1,
-    'sonar_imm.parameters': 2,
-    'sonar_imm.measurements': 2,
-    'sonar_imm.truth': 2,
-    'sonar_imm.estimates': 2,
-    'sonar_imm.soundings': 2,
-    'msg_adapters': 3,
-    'sonar_imm.intake': 3,
-    'sonar_imm.trackers': 4,
-    'sonar_imm.node_config': 5,
-    'sonar_imm.nodes': 6,
-    'sonar_imm_tools.resources': 7,
-    'sonar_imm_tools.recordings': 7,
-    'sonar_imm_tools.simulation': 8,
-    'sonar_imm_tools.replay': 8,
-    'sonar_imm_tools.offline': 8,
-    'sonar_imm_tools.evaluation': 9,
-    'sonar_imm_tools.survey': 9,
+    'sonar_imm.files': 0, 'sonar_imm.gone': 0, 'sonar_imm.texts': 0, 'sonar_imm.threads': 0,
+    'sonar_imm.estimation': 0, 'sonar_imm.acoustics': 1, 'sonar_imm.parameters': 2,
+    'sonar_imm.measurements': 2, 'sonar_imm.truth': 2, 'sonar_imm.estimates': 2,
+    'sonar_imm.soundings': 2, 'msg_adapters': 3, 'sonar_imm.intake': 3, 'sonar_imm.trackers': 4,
+    'sonar_imm.node_config': 5, 'sonar_imm.nodes': 6, 'sonar_imm_tools.resources': 7,
+    'sonar_imm_tools.recordings': 7, 'sonar_imm_tools.simulation': 8, 'sonar_imm_tools.replay': 8,
+    'sonar_imm_tools.offline': 8, 'sonar_imm_tools.evaluation': 9, 'sonar_imm_tools.survey': 9,
     'sonar_imm_tools.cli': 10,
-}
+}  # fmt: skip
 # Rooms of one floor, or of neighbouring ones, that must not know each other.
 APART = (
     ('msg_adapters', 'sonar_imm.trackers'),
@@ -75,7 +62,7 @@ DESK = {'click', 'plotly', 'rich', 'rosbags', 'sonar_imm_tools'}
 """What only the workbench may import: the live package runs without it."""
 
 
-def test_imports_go_down_the_floors() -> None:
+def test_imports_go_down_the_floors():
     for path in MODULES:
         here = room_of(module_name(path))
         # sonar_imm/__init__.py looks whether msg_adapters is its own, and opens the filter.
@@ -92,7 +79,7 @@ def test_imports_go_down_the_floors() -> None:
                 assert (there, here) not in APART, f'{here} must not import {name}'
 
 
-def test_ros_and_the_workbench_stay_in_their_rooms() -> None:
+def test_ros_and_the_workbench_stay_in_their_rooms():
     for path in MODULES:
         here = room_of(module_name(path))
         for name in imports(path):
@@ -103,7 +90,7 @@ def test_ros_and_the_workbench_stay_in_their_rooms() -> None:
                 assert top not in DESK, f'{here} must not import {name}'
 
 
-def test_the_live_package_is_there_without_the_workbench() -> None:
+def test_the_live_package_is_there_without_the_workbench():
     """Trackers are imported and built by a process that can import nothing of the desk."""
     program = f"""
 import sys
@@ -121,7 +108,7 @@ for system in SYSTEMS.values():
     assert done.returncode == 0, done.stderr
 
 
-def test_the_floor_check_sees_relative_and_inner_imports(tmp_path: Path) -> None:
+def test_the_floor_check_sees_relative_and_inner_imports():
     file = ROOT / 'sonar_imm' / 'estimation' / 'imagined.py'
     source = (
         'from ..nodes import diver\nfrom .. import trackers\nfrom . import kalman\n'
@@ -135,7 +122,7 @@ def test_the_floor_check_sees_relative_and_inner_imports(tmp_path: Path) -> None
     }
 
 
-def test_no_module_imports_itself_by_way_of_others() -> None:
+def test_no_module_imports_itself_by_way_of_others():
     """No circle, also none that an import inside a function or for type checking closes."""
     modules = {module_name(path): path for path in MODULES}
     graph = {
@@ -146,12 +133,117 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
     assert circle_of(graph) is None
 
 
-def test_the_circle_check_sees_circles() -> None:
+def test_the_circle_check_sees_circles():
     assert circle_of({'a': {'b'}, 'b': {'c'}, 'c': set()}) is None
     found = circle_of({'a': {'b'}, 'b': {'c'}, 'c': {'d'}, 'd': {'b'}})
     assert found == ['b', 'c', 'd', 'b']
 
 
-def room_of(name: str) -> str | None:
+def room_of(name):
     """The room a dotted name lies in, None outside the house."""
     return next((room for room in FLOORS if name == room or name.startswith(room + '.')), None)
+
+
+# -- examples in docstrings --
+
+WITH_EXAMPLES = [
+    module_name(path) for path in MODULES if '>>> ' in path.read_text(encoding='utf-8')
+]
+
+
+@pytest.mark.parametrize('name', WITH_EXAMPLES)
+def test_examples_do_what_they_say(name):
+    found = doctest.testmod(import_module(name))
+    assert found.attempted > 0 and found.failed == 0
+
+
+def test_the_rooms_for_others_have_examples():
+    rooms = {name.split('.')[1] for name in WITH_EXAMPLES}
+    assert {'estimation', 'acoustics', 'trackers'} <= rooms and len(WITH_EXAMPLES) >= 12
+
+
+# -- nothing that came from a file or a process is run: the sources call nothing that could --
+
+RUNS = {'eval', 'exec', 'compile', '__import__'}
+UNPICKLE = {'pickle', '_pickle', 'cPickle', 'marshal', 'shelve', 'joblib', 'dill', 'cloudpickle'}
+UNPICKLE |= {'xtf_read', 'xtf_read_gen'}
+"""The readers of pyxtf unpickle an index beside the file."""
+YAML = {'load', 'load_all', 'unsafe_load', 'full_load', 'UnsafeLoader', 'FullLoader', 'Loader'}
+
+
+def faults(tree):
+    """What of a module could run what it reads, as (line, what)."""
+    for node in ast.walk(tree):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [node.module or '', *(alias.name for alias in node.names)]
+        if found := UNPICKLE.intersection(part for name in names for part in name.split('.')):
+            yield node.lineno, found.pop()
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) == 'yaml':
+            if node.attr in YAML:
+                yield node.lineno, f'yaml.{node.attr}'
+        if isinstance(node, ast.Call):
+            yield from _calls(node)
+
+
+def _calls(node):
+    called = ast.unparse(node.func)
+    given = {word.arg: word.value for word in node.keywords}
+    if called in RUNS or called in ('os.system', 'os.popen', 'builtins.eval', 'builtins.exec'):
+        yield node.lineno, called
+    if called.split('.')[-1] == 'load' and called.split('.')[0] in ('np', 'numpy'):
+        if ast.unparse(given.get('allow_pickle', ast.Constant(True))) != 'False':
+            yield node.lineno, 'np.load without allow_pickle=False'
+    elif 'allow_pickle' in given and ast.unparse(given['allow_pickle']) != 'False':
+        yield node.lineno, 'allow_pickle'
+    if 'shell' in given and ast.unparse(given['shell']) != 'False':
+        yield node.lineno, 'shell'
+
+
+def test_no_module_runs_what_it_reads():
+    found = {}
+    for path in MODULES:
+        name = module_name(path)
+        wrong = list(faults(tree_of(path)))
+        if wrong:
+            found[name] = wrong
+    assert not found
+
+
+@pytest.mark.parametrize(
+    'source',
+    [
+        'import pickle',
+        'from pickle import loads',
+        'from concurrent import x; import numpy, joblib',
+        'def f():\n    import marshal',
+        'eval("1")',
+        'exec(text)',
+        'os.system("ls")',
+        'yaml.load(text)',
+        'yaml.load(text, yaml.SafeLoader)',
+        'yaml.unsafe_load(text)',
+        'np.load(file)',
+        'np.load(file, allow_pickle=True)',
+        'np.load(file, allow_pickle=x)',
+        'np.savez(file, allow_pickle=True)',
+        'subprocess.run(words, shell=True)',
+    ],
+)
+def test_the_check_sees_what_runs(source):
+    assert list(faults(ast.parse(source)))
+
+
+@pytest.mark.parametrize(
+    'source',
+    [
+        'np.load(file, allow_pickle=False)',
+        'yaml.safe_load(text)',
+        're.compile(text)',
+        'json.load(f)',
+    ],
+)
+def test_the_check_leaves_the_rest(source):
+    assert not list(faults(ast.parse(source)))

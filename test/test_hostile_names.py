@@ -51,16 +51,12 @@ def is_harmless(text):
 def estimate(model):
     """Two confirmed tracks; one model has this name."""
     return Estimate(
-        stamp_ns=1,
-        frame_id='map',
-        xyz=np.zeros((2, 3), np.float32),
-        state_names=('px', 'py', 'vx', 'vy'),
-        state=np.ones((2, 4)),
-        covariance=np.tile(np.eye(4), (2, 1, 1)),
-        model_names=(model,),
+        stamp_ns=1, frame_id='map', xyz=np.zeros((2, 3), np.float32),
+        state_names=('px', 'py', 'vx', 'vy'), state=np.ones((2, 4)),
+        covariance=np.tile(np.eye(4), (2, 1, 1)), model_names=(model,),
         probabilities=np.ones((2, 1)),
         extras={'track_id': np.arange(2, dtype='u4'), 'track_state': np.ones(2, 'u1')},
-    )
+    )  # fmt: skip
 
 
 def test_what_would_steer_a_terminal_is_shown():

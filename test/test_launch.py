@@ -11,8 +11,6 @@
 They are read as XML here; `test/system/test_launch.py` runs them where ROS 2 launch is installed.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 import re
 import xml.etree.ElementTree as ElementTree
@@ -27,7 +25,6 @@ from msg_adapters.headers import swap_axes
 from msg_adapters.inputs import inputs_of
 from msg_adapters.table import encode_table
 from sonar_imm.acoustics.geometry import rotation
-from sonar_imm.estimates import Estimate
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.recordings.messages import ros_message
@@ -39,11 +36,11 @@ FILES = sorted(FOLDER.glob('*.launch.xml'))
 SHARE = '$(find-pkg-share sonar_imm)/'
 
 
-def tree(name: str) -> ElementTree.Element:
+def tree(name):
     return ElementTree.parse(FOLDER / f'{name}.launch.xml').getroot()
 
 
-def declared(root: ElementTree.Element) -> set[str]:
+def declared(root):
     return {arg.get('name') for arg in root.findall('arg')}
 
 
@@ -59,7 +56,7 @@ def test_each_node_has_a_launch_file_that_starts_its_executable(system):
     assert node.get('name') == '$(var system)'
 
 
-def executables() -> set[str]:
+def executables():
     """What setup.py installs for `ros2 run`."""
     names = {f'{system}_node' for system in SYSTEMS}
     return names | set(re.findall(r"'(\w+_node) = ", (ROOT / 'setup.py').read_text()))
@@ -102,7 +99,7 @@ def test_every_argument_and_file_that_is_used_is_there(path):
 TUTORIAL = ROOT / 'docs/tutorials/ros_avoidance.md'
 
 
-def block(kind: str) -> str:
+def block(kind):
     """The only block of that kind on the page."""
     (text,) = re.findall(rf'^```{kind}\n(.*?)^```$', TUTORIAL.read_text(), re.M | re.S)
     return text
@@ -150,7 +147,7 @@ def test_the_costmap_of_the_tutorial_takes_what_is_sent():
     assert settings['plugins'] == ['obstacle_layer', 'inflation_layer']
 
 
-def one_estimate() -> Estimate:
+def one_estimate():
     """The last estimate of a short approach."""
     tracker = ObstacleTracker(ObstacleConfig())
     scene = simulate(scenario('approach', {'last_range': 60.0}), 1)

@@ -18,14 +18,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 
-from helpers.source import (
-    COME_WITH_RCLPY,
-    COMMON_INTERFACES,
-    imports,
-    module_name,
-    MODULES,
-    ROOT,
-)
+from helpers.source import COME_WITH_RCLPY, COMMON_INTERFACES, imports, module_name, MODULES, ROOT
 import pytest
 import yaml
 
@@ -37,25 +30,14 @@ if not (ROOT / 'setup.py').is_file():
 
 # rosdep keys (package.xml) and PyPI names (setup.py) of the same thing.
 PYPI_OF_KEY = {
-    'python3-attrs': 'attrs',
-    'python3-click': 'click',
-    'python3-filterpy-pip': 'filterpy',
-    'python3-hypothesis': 'hypothesis',
-    'python3-jinja2': 'jinja2',
-    'python3-numba': 'numba',
-    'python3-numpy': 'numpy',
-    'python3-pymap3d': 'pymap3d',
-    'python3-pytest': 'pytest',
-    'python3-pytest-benchmark': 'pytest-benchmark',
-    'python3-pytest-xdist': 'pytest-xdist',
-    'python3-pil': 'pillow',
-    'python3-rasterio': 'rasterio',
-    'python3-rich': 'rich',
-    'python3-rosbags-pip': 'rosbags',
-    'python3-scipy': 'scipy',
-    'python3-stonesoup-pip': 'stonesoup',
-    'python3-yaml': 'PyYAML',
-}
+    'python3-attrs': 'attrs', 'python3-click': 'click', 'python3-filterpy-pip': 'filterpy',
+    'python3-hypothesis': 'hypothesis', 'python3-jinja2': 'jinja2', 'python3-numba': 'numba',
+    'python3-numpy': 'numpy', 'python3-pymap3d': 'pymap3d', 'python3-pytest': 'pytest',
+    'python3-pytest-benchmark': 'pytest-benchmark', 'python3-pytest-xdist': 'pytest-xdist',
+    'python3-pil': 'pillow', 'python3-rasterio': 'rasterio', 'python3-rich': 'rich',
+    'python3-rosbags-pip': 'rosbags', 'python3-scipy': 'scipy',
+    'python3-stonesoup-pip': 'stonesoup', 'python3-yaml': 'PyYAML',
+}  # fmt: skip
 """All keys are in rosdep/python.yaml of ros/rosdistro, as of 2026-08-22, with Ubuntu 24.04."""
 RELEASED = {'ament_copyright', 'ament_flake8', 'ament_pep257', 'rclpy'}
 """Packages of Jazzy besides messages that are named in package.xml."""
@@ -93,12 +75,12 @@ LONGEST = 600
 
 
 @pytest.fixture(scope='module')
-def manifest() -> ElementTree.Element:
+def manifest():
     return ElementTree.parse(ROOT / 'package.xml').getroot()
 
 
 @pytest.fixture(scope='module')
-def setup_lists() -> dict[str, object]:
+def setup_lists():
     """The literals assigned at the top of setup.py."""
     tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
     return {
@@ -108,25 +90,23 @@ def setup_lists() -> dict[str, object]:
     }
 
 
-def test_there_is_one_version(manifest: ElementTree.Element) -> None:
+def test_there_is_one_version(manifest):
     assert sonar_imm.__version__ == msg_adapters.__version__ == manifest.findtext('version')
     changelog = (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8')
     assert re.search(rf'^{re.escape(sonar_imm.__version__)} \(.+\)$', changelog, re.MULTILINE)
 
 
-def test_every_key_of_package_xml_is_one_of_rosdep_or_a_package_of_jazzy(
-    manifest: ElementTree.Element,
-) -> None:
+def test_every_key_of_package_xml_is_one_of_rosdep_or_a_package_of_jazzy(manifest):
     keys = {each.text for each in manifest if each.tag.endswith('depend')}
     assert keys <= {*PYPI_OF_KEY, *RELEASED, *COMMON_INTERFACES, *COME_WITH_RCLPY}
 
 
-def test_catkin_reads_the_package_and_its_changelog() -> None:
+def test_catkin_reads_the_package_and_its_changelog():
     """As bloom, colcon and rosdoc2 do."""
     package = pytest.importorskip('catkin_pkg.package')
     from catkin_pkg.changelog import get_changelog_from_path
 
-    warned: list[str] = []
+    warned = []
     read = package.parse_package(str(ROOT))
     read.validate(warnings=warned)
     assert not warned
@@ -137,16 +117,12 @@ def test_catkin_reads_the_package_and_its_changelog() -> None:
     assert version == read.version
 
 
-def test_package_xml_and_setup_name_the_same_run_time_dependencies(
-    manifest: ElementTree.Element, setup_lists: dict[str, list[str]]
-) -> None:
+def test_package_xml_and_setup_name_the_same_run_time_dependencies(manifest, setup_lists):
     wanted = {PYPI_OF_KEY[key] for key in texts(manifest, 'exec_depend') if key != 'rclpy'}
     assert wanted | WITHOUT_KEY == {distribution(line) for line in setup_lists['REQUIRES']}
 
 
-def test_package_xml_and_setup_pin_the_same_versions(
-    manifest: ElementTree.Element, setup_lists: dict[str, list[str]]
-) -> None:
+def test_package_xml_and_setup_pin_the_same_versions(manifest, setup_lists):
     extras = setup_lists['EXTRAS']
     assert isinstance(extras, dict)
     pins = {
@@ -161,9 +137,7 @@ def test_package_xml_and_setup_pin_the_same_versions(
                 assert given == pins[name], name
 
 
-def test_package_xml_and_setup_name_the_same_test_dependencies(
-    manifest: ElementTree.Element, setup_lists: dict[str, dict[str, list[str]]]
-) -> None:
+def test_package_xml_and_setup_name_the_same_test_dependencies(manifest, setup_lists):
     # The linters of ament come with ROS 2, not from PyPI.
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
@@ -178,14 +152,12 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
             'pyxtf',
             'segyio',
             'soundfile',
-        ),
+        )
     }
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 
 
-def test_every_import_is_declared(
-    manifest: ElementTree.Element, setup_lists: dict[str, list[str]]
-) -> None:
+def test_every_import_is_declared(manifest, setup_lists):
     declared = {
         IMPORT_OF_PYPI.get(name, name)
         for name in (distribution(line) for line in setup_lists['REQUIRES'])
@@ -198,16 +170,14 @@ def test_every_import_is_declared(
         assert used - declared <= PEERS.get(module_name(path), set()), path
 
 
-def test_the_citation_names_this_version() -> None:
+def test_the_citation_names_this_version():
     cited = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
     assert cited['version'] == sonar_imm.__version__ and len(cited['references']) == 4
     dated = re.search(r'^(\S+) \(([\d-]+)\)$', (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
     assert dated and cited.get('date-released', dated[2]) == dated[2]
 
 
-def test_the_conda_recipe_has_the_version_and_the_requirements_of_setup(
-    setup_lists: dict[str, list[str]],
-) -> None:
+def test_the_conda_recipe_has_the_version_and_the_requirements_of_setup(setup_lists):
     recipe = yaml.safe_load((ROOT / 'conda' / 'recipe.yaml').read_text(encoding='utf-8'))
     assert recipe['package']['version'] == sonar_imm.__version__
     wanted = {line.replace(' ', '').lower() for line in recipe['requirements']['run']}
@@ -221,7 +191,7 @@ def test_the_conda_recipe_has_the_version_and_the_requirements_of_setup(
     }
 
 
-def test_tests_that_start_processes_lie_where_make_looks_for_them() -> None:
+def test_tests_that_start_processes_lie_where_make_looks_for_them():
     """Collecting all the others takes longer than many of them."""
     marked = [
         path for path in (ROOT / 'test').rglob('*.py') if f'mark.{"system"}' in path.read_text()
@@ -229,11 +199,11 @@ def test_tests_that_start_processes_lie_where_make_looks_for_them() -> None:
     assert {path.relative_to(ROOT / 'test').parts[0] for path in marked} == {'system'}
 
 
-def test_declared_messages_come_with_the_ros_extra(manifest: ElementTree.Element) -> None:
+def test_declared_messages_come_with_the_ros_extra(manifest):
     assert texts(manifest, 'depend') <= COMMON_INTERFACES | COME_WITH_RCLPY
 
 
-def test_files_begin_with_the_licence_and_are_not_too_long() -> None:
+def test_files_begin_with_the_licence_and_are_not_too_long():
     files = [
         path
         for room in ('sonar_imm', 'sonar_imm_tools', 'msg_adapters', 'test', 'benchmarks', 'docs')
@@ -252,7 +222,7 @@ def test_files_begin_with_the_licence_and_are_not_too_long() -> None:
     assert not {name for name, lines in lengths.items() if lines > LONGEST}
 
 
-def test_generated_files_are_up_to_date() -> None:
+def test_generated_files_are_up_to_date():
     spec = importlib.util.spec_from_file_location('generate', ROOT / 'docs' / 'generate.py')
     generate = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(generate)
@@ -263,7 +233,7 @@ def test_generated_files_are_up_to_date() -> None:
         assert found == text, f'{name} is out of date: run `make generate`'
 
 
-def test_every_system_is_found_by_its_name() -> None:
+def test_every_system_is_found_by_its_name():
     """The record of a system names modules; each has to be there with what it is to provide."""
     from msg_adapters.inputs import inputs_of
     from sonar_imm.node_config import node_config_type, NodeConfig
@@ -281,7 +251,7 @@ def test_every_system_is_found_by_its_name() -> None:
         assert f'## {name}_node' in (ROOT / 'docs' / 'topics.md').read_text(encoding='utf-8')
 
 
-def test_every_folder_of_a_system_is_listed_and_built() -> None:
+def test_every_folder_of_a_system_is_listed_and_built():
     """A folder that `SYSTEMS` does not know would never be used; setup.py goes by the folders."""
     from sonar_imm.trackers import SYSTEMS
 
@@ -303,11 +273,11 @@ def test_every_folder_of_a_system_is_listed_and_built() -> None:
     assert found == list(SYSTEMS)
 
 
-def kinds(value: object) -> object:
+def kinds(value):
     return [type(item) for item in value] if isinstance(value, list) else type(value)
 
 
-def test_default_parameter_file_holds_the_defaults() -> None:
+def test_default_parameter_file_holds_the_defaults():
     from sonar_imm.parameters import parameters_from_yaml
     from sonar_imm.trackers import SYSTEMS
 
@@ -331,7 +301,7 @@ def test_default_parameter_file_holds_the_defaults() -> None:
         ('numpy', 'pip install sonar_imm brings it.'),
     ],
 )
-def test_a_node_says_what_is_missing(missing: str, advice: str) -> None:
+def test_a_node_says_what_is_missing(missing, advice):
     program = """
 import sys
 from sonar_imm.nodes.commands import main
@@ -352,7 +322,7 @@ sys.exit(main())
     assert done.stderr.splitlines() == [f'diver_node: {missing} is not here. {advice}']
 
 
-def test_the_page_of_commands_names_every_subcommand() -> None:
+def test_the_page_of_commands_names_every_subcommand():
     from sonar_imm_tools.cli import COMMANDS
 
     page = (ROOT / 'docs' / 'reference' / 'commands.md').read_text(encoding='utf-8')
@@ -360,7 +330,7 @@ def test_the_page_of_commands_names_every_subcommand() -> None:
     assert set(re.findall(r'^\| `([a-z]+)', table, re.MULTILINE)) == set(COMMANDS)
 
 
-def test_the_examples_of_the_library_run(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_examples_of_the_library_run(capsys):
     page = (ROOT / 'docs' / 'howto' / 'library.md').read_text(encoding='utf-8')
     table = page.partition('| name | use |')[2].partition('\n\n')[0]
     assert sorted(re.findall(r'`(\w+)`', table)) == sorted(sonar_imm.__all__)
@@ -372,9 +342,39 @@ def test_the_examples_of_the_library_run(capsys: pytest.CaptureFixture[str]) -> 
     assert len(examples) == 4 and len(lines) <= 10
 
 
-def texts(manifest: ElementTree.Element, tag: str) -> set[str]:
+def texts(manifest, tag):
     return {element.text for element in manifest.iter(tag)}
 
 
-def distribution(requirement: str) -> str:
+def distribution(requirement):
     return re.match(r'[A-Za-z0-9_.-]+', requirement).group()
+
+
+# -- the linters of ament, where they are installed (a ROS 2 machine: `rosdep install -t test`);
+# elsewhere ruff and the tests above check the same things --
+
+NAMES = 'benchmarks docs examples msg_adapters sonar_imm sonar_imm_tools test setup.py'
+SOURCES = [str(ROOT / name) for name in NAMES.split()]
+
+
+@pytest.mark.linter
+@pytest.mark.copyright
+def test_every_file_has_its_copyright_and_licence():
+    main = pytest.importorskip('ament_copyright.main')
+    assert main.main(argv=SOURCES) == 0
+
+
+@pytest.mark.linter
+@pytest.mark.flake8
+def test_the_style_is_what_setup_cfg_says():
+    main = pytest.importorskip('ament_flake8.main')
+    assert main.main(argv=['--config', str(ROOT / 'setup.cfg'), *SOURCES]) == 0
+
+
+@pytest.mark.linter
+@pytest.mark.pep257
+def test_docstrings_are_well_formed():
+    main = pytest.importorskip('ament_pep257.main')
+    # The form of a summary is the project's own, as in setup.cfg.
+    ours = 'D205 D209 D213 D400 D401 D402 D403 D415'.split()
+    assert main.main(argv=['--add-ignore', *ours, '--', *SOURCES]) == 0

@@ -6,7 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The site: every page is in its navigation, every public module in its API, nothing from afar.
+"""The site: every page is in its navigation, every public module in its API, nothing from afar;
+pages with measured numbers; the rows of SECURITY.md.
 
 Building it needs mkdocs, and `make docs` is strict itself; these tests need neither.
 """
@@ -14,10 +15,10 @@ Building it needs mkdocs, and `make docs` is strict itself; these tests need nei
 from __future__ import annotations
 
 import importlib
+import json
 import re
 import sys
 from types import SimpleNamespace
-from typing import Any
 
 from helpers.source import ROOT
 import pytest
@@ -33,19 +34,22 @@ NO_API = {'sonar_imm_tools.cli', 'sonar_imm.nodes'}
 sys.path.insert(0, str(ROOT / 'docs'))  # as for a script there
 
 
+result_pages = importlib.import_module('result_pages')
+
+
 @pytest.fixture(scope='module')
-def made() -> Any:
+def made():
     return importlib.import_module('site_pages')
 
 
-def in_navigation(entry: Any) -> set[str]:
+def in_navigation(entry):
     if isinstance(entry, str):
         return {entry}
     parts = entry.values() if isinstance(entry, dict) else entry
     return set().union(*map(in_navigation, parts))
 
 
-def test_every_page_is_in_the_navigation(made: Any) -> None:
+def test_every_page_is_in_the_navigation(made):
     config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
     pages = {path.relative_to(ROOT / 'docs').as_posix() for path in (ROOT / 'docs').rglob('*.md')}
     pages |= {*made.OUTSIDE.values(), *(f'reference/api/{name}.md' for name in made.API)}
@@ -57,13 +61,13 @@ def test_every_page_is_in_the_navigation(made: Any) -> None:
     }
 
 
-def test_every_recording_is_on_their_page(made: Any) -> None:
+def test_every_recording_is_on_their_page(made):
     page = made.recordings()
     for path in (ROOT / 'bags').glob('*/README.md'):
         assert f'| [{path.parent.name}](#' in page and f'## {path.parent.name}\n' in page
 
 
-def test_the_api_has_every_public_module(made: Any) -> None:
+def test_the_api_has_every_public_module(made):
     described = set().union(*(made.modules(package) for package, _ in made.API.values()))
     files = [*(ROOT / 'sonar_imm').rglob('*.py'), *(ROOT / 'msg_adapters').rglob('*.py')]
     names = {'.'.join(path.relative_to(ROOT).with_suffix('').parts) for path in files}
@@ -75,7 +79,7 @@ def test_the_api_has_every_public_module(made: Any) -> None:
     assert 'set_kernels' not in made.api_page('sonar_imm.estimation', 'x')
 
 
-def test_files_and_tests_named_on_pages_exist() -> None:
+def test_files_and_tests_named_on_pages_exist():
     files = [
         path.relative_to(ROOT)
         for room in (
@@ -100,7 +104,7 @@ def test_files_and_tests_named_on_pages_exist() -> None:
 
 
 @pytest.mark.parametrize('name', ['README.md', 'CONTRIBUTING.md', 'CHANGELOG.rst'])
-def test_links_of_pages_from_the_root_lead_to_pages(made: Any, name: str) -> None:
+def test_links_of_pages_from_the_root_lead_to_pages(made, name):
     text = made.at_the_root(name)
     assert text.startswith('# ')
     for target in re.findall(r'\]\(([^)#]+)', text):
@@ -108,13 +112,13 @@ def test_links_of_pages_from_the_root_lead_to_pages(made: Any, name: str) -> Non
         assert '://' in target or known, target
 
 
-def slug(heading: str) -> str:
+def slug(heading):
     """The anchor of a heading."""
     words = re.sub(r'\[([^\]]*)\]\([^)]*\)', r'\1', heading).strip().lower()
     return re.sub(r'[^\w\- ]', '', words).replace(' ', '-')
 
 
-def test_links_between_files_lead_somewhere() -> None:
+def test_links_between_files_lead_somewhere():
     pages = {
         path: re.sub(r'^```.*?^```', '', path.read_text(encoding='utf-8'), flags=re.M | re.S)
         for path in [*ROOT.glob('*.md'), *(ROOT / 'docs').rglob('*.md')]
@@ -133,13 +137,13 @@ def test_links_between_files_lead_somewhere() -> None:
     assert broken == set()
 
 
-def test_links_to_notebooks_lead_to_their_pages(made: Any) -> None:
+def test_links_to_notebooks_lead_to_their_pages(made):
     text = '[a](../../examples/own_data.ipynb), [b](../runs.md)'
     shown = made.on_page_markdown(text, None, None, None)
     assert shown == '[a](../examples/own_data.md), [b](../runs.md)'
 
 
-def test_a_site_alone_asks_for_no_list_of_versions(made: Any, monkeypatch: Any) -> None:
+def test_a_site_alone_asks_for_no_list_of_versions(made, monkeypatch):
     config = SimpleNamespace(extra={'version': {'provider': 'mike'}})
     monkeypatch.setenv('SITE_VERSIONS', '1')
     assert 'version' in made.on_config(config).extra
@@ -147,7 +151,7 @@ def test_a_site_alone_asks_for_no_list_of_versions(made: Any, monkeypatch: Any) 
     assert 'version' not in made.on_config(config).extra
 
 
-def test_what_comes_from_another_server_is_seen(made: Any) -> None:
+def test_what_comes_from_another_server_is_seen(made):
     page = (
         '<link rel="canonical" href="https://a.org/"><link rel=stylesheet href=assets/a.css>'
         '<a href="https://b.org">b</a><script src="https://c.org/c.js"></script>'
@@ -160,7 +164,7 @@ def test_what_comes_from_another_server_is_seen(made: Any) -> None:
     ]
 
 
-def test_on_a_phone_each_cell_has_the_head_of_its_column(made: Any) -> None:
+def test_on_a_phone_each_cell_has_the_head_of_its_column(made):
     page = (
         '<p><table>\n<thead>\n<tr>\n<th>a</th>\n<th style="x">b <code>c</code></th>\n'
         '</tr>\n</thead>\n'
@@ -171,8 +175,89 @@ def test_on_a_phone_each_cell_has_the_head_of_its_column(made: Any) -> None:
     assert shown.endswith('<td>')
 
 
-def test_the_search_needs_no_server() -> None:
+def test_the_search_needs_no_server():
     config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
     (script,) = config['extra']['polyfills']
     assert 'iframe-worker' in script, 'else the plugin loads one of this name from afar'
     assert 'offline' in config['plugins'] and (ROOT / 'docs' / script).is_file()
+
+
+# -- each row of SECURITY.md names a file of tests that exists --
+
+ROWS = [
+    line
+    for line in (ROOT / 'SECURITY.md').read_text(encoding='utf-8').splitlines()
+    if line.startswith('| ')
+][1:]
+
+
+@pytest.mark.parametrize('row', ROWS)
+def test_every_row_names_a_file_of_tests(row):
+    (name,) = re.findall(r'`(test/[\w/]+\.py)` \|$', row)
+    assert 'def test_' in (ROOT / name).read_text(encoding='utf-8')
+
+
+# -- pages with measured numbers: each is that of its file, and one that is missing fails --
+
+FILE = {
+    'made': {'command': 'python -m benchmarks.x', 'date': '2026-11-29', 'commit': 'abcd1234'},
+    'runs': 20,
+    'scenes': {
+        'calm': {'RMSE': 0.1234, 'share': 0.5, 'kept': None},
+        'rough': {'RMSE': float('nan'), 'share': 0.25, 'cover': 0.9},
+    },
+    'all': [1.0, 2.5],
+}
+
+
+@pytest.fixture
+def numbers(tmp_path):
+    (tmp_path / 'x.json').write_text(json.dumps(FILE))
+    return result_pages.Numbers(tmp_path)
+
+
+def test_a_number_has_two_decimals_or_its_format(numbers):
+    assert numbers.n('x>scenes>calm>RMSE') == '0.12'
+    assert numbers.n('x>scenes>calm>RMSE', '.3f') == '0.123'
+    assert numbers.n('x>scenes>calm>share', '.0%') == '50 %'
+    assert (numbers.n('x>runs'), numbers.n('x>all>1')) == ('20', '2.50')
+    assert numbers.n('x>scenes>calm>kept') == numbers.n('x>scenes>rough>RMSE') == '-'
+
+
+def test_files_below_no_table_are_named_at_the_end(numbers):
+    assert numbers.sources() == ''
+    numbers.n('x>runs')
+    assert 'text: [x.json](x.json), 2026-11-29, abcd1234<' in numbers.sources()
+
+
+@pytest.mark.parametrize('path', ['x>scenes>storm>RMSE', 'x>runs>RMSE', 'x>all>2', 'x>all>first'])
+def test_a_number_that_is_missing_is_named(numbers, path):
+    with pytest.raises(LookupError, match=re.escape(path)):
+        numbers.n(path)
+
+
+def test_a_table_has_a_row_for_each_entry_and_a_caption(numbers):
+    columns = {'RMSE, m': 'RMSE|.3f', 'inside': '{share|.0%} ({cover / kept})'}
+    assert numbers.table('x>scenes>{row}>{col}', columns, first='scene') == (
+        '| scene | RMSE, m | inside |\n|---|---|---|\n'
+        '| calm | 0.123 | 50 % (-) |\n| rough | - | 25 % (0.90) |\n\n'
+        '<small>[x.json](x.json), 2026-11-29, abcd1234</small>'
+    )
+    assert numbers.sources() == ''
+    short = numbers.table('x>{col}', {'share': 'scenes>@>share'}, {'a': 'rough'}, caption=False)
+    assert short.splitlines()[2:] == ['| a | 0.25 |']
+
+
+@pytest.mark.parametrize('columns', [{'a': 'RMSE', 'b': 'rmse'}, {'a': 'cover'}])
+def test_a_row_or_a_column_without_numbers_is_an_error(numbers, columns):
+    with pytest.raises(LookupError):
+        numbers.table('x>scenes>{row}>{col}', columns)
+
+
+def test_a_table_replaces_the_one_of_the_same_head():
+    page = 'Before.\n\n| a | b |\n|---|---|\n| 1 | 2 |\n| 3 | 4 |\n\nAfter.\n'
+    table = '| a | b |\n|---|---|\n| 5 | 6 |\n'
+    assert result_pages.with_table(page, table) == f'Before.\n\n{table}\nAfter.\n'
+    for other in ('Nothing.\n', page + page):
+        with pytest.raises(ValueError, match='not one'):
+            result_pages.with_table(other, table)

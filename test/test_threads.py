@@ -50,12 +50,9 @@ def threads_of(tmp_path_factory):
         }
         paths = os.pathsep.join([str(tmp_path), str(ROOT), str(ROOT / 'test')])
         done = subprocess.run(
-            [sys.executable, *arguments],
-            env={**kept, 'PYTHONPATH': paths, **message},
-            capture_output=True,
-            text=True,
-            cwd=tmp_path,
-        )
+            [sys.executable, *arguments], env={**kept, 'PYTHONPATH': paths, **message},
+            capture_output=True, text=True, cwd=tmp_path,
+        )  # fmt: skip
         assert 'threads ' in done.stderr, done.stderr
         return int(done.stderr.rsplit('threads ', 1)[1].split()[0])
 

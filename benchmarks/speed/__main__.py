@@ -6,13 +6,16 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The cost of a step of each tracker, as a file of results: what `sonar-imm bench` measures.
+"""The cost of a step of each tracker, as a file of results: what `sonar-imm bench` measures; of a
+record by kernels for other processors; and of the first start.
 
-python -m benchmarks.speed --out docs/results/speed.json
+    python -m benchmarks.speed --out docs/results/speed.json
+    python -m benchmarks.speed --parts "first start" --add --out docs/results/speed.json
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import hashlib
 import json
 import os
@@ -24,10 +27,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.speed import benches_of
+from benchmarks.speed.cold_start import cold_start, STARTS
 from benchmarks.speed.fathometer import bench_record, FathometerConfig, FathometerTracker, trace
-from benchmarks.study import Parts, study
+from benchmarks.study import in_fresh_process, Parts, study
 
-STEPS = ('diver step', 'diver clutter', 'obstacle ping', 'bathymetry numpy', 'fathometer record')
+STEPS = ('diver step', 'diver clutter', 'obstacle ping', 'bathymetry ping', 'fathometer record')
 """System and name of the benches that the page on speed shows."""
 TARGETS = {
     'this processor': {},
@@ -35,16 +39,23 @@ TARGETS = {
     'generic': {'NUMBA_CPU_NAME': 'generic', 'NUMBA_CPU_FEATURES': ''},
 }
 """Processors that numba compiles for, by its own variables: see docker/numba_target.sh."""
+PARTS = ('steps', 'kernel targets', 'first start')
 
 
-def main(rounds: int = 7, steps: tuple[str, ...] = STEPS, targets: bool = True) -> Parts:
-    yield {'rounds': rounds, 'load': os.getloadavg()[0], 'processors': os.cpu_count()}
-    for step in steps:
+def main(rounds: int = 7, parts: Sequence[str] = PARTS, steps: Sequence[str] = STEPS) -> Parts:
+    if 'steps' in parts and len(steps) == len(STEPS):
+        yield {'rounds': rounds, 'load': os.getloadavg()[0], 'processors': os.cpu_count()}
+    for step in steps if 'steps' in parts else ():
         system, name = step.split()
         (bench,) = (bench for bench in benches_of(system) if bench.name == name)
         yield {'steps': {step: bench.measure(rounds)}}
-    if targets:
+    if 'kernel targets' in parts:
         yield {'kernel targets': kernel_targets(rounds)}
+    for name, case in STARTS.items() if 'first start' in parts else ():
+        with tempfile.TemporaryDirectory() as cache:
+            # Read when numba is imported, which the process does before it is called.
+            os.environ['NUMBA_CACHE_DIR'] = cache
+            yield {'first start': {name: in_fresh_process(cold_start, case, cache)}}
 
 
 def kernel_targets(rounds: int) -> dict[str, Any]:
@@ -86,4 +97,4 @@ def child() -> None:
 
 
 if __name__ == '__main__':
-    study(main)
+    study(main, parts={'choices': PARTS}, steps={'choices': STEPS})

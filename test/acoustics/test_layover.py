@@ -67,7 +67,7 @@ def test_two_exact_waves_leave_nothing(staves, spacing):
 
 
 def test_a_search_over_all_pairs_finds_hardly_more():
-    y = snapshots(150, 8, 25.0, 2, np.random.default_rng(1))
+    y = snapshots(80, 8, 25.0, 2, np.random.default_rng(1))
     power, _, two = layover.residuals(y, 0.5)
     q = np.arange(8)[:, None]
 

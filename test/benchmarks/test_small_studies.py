@@ -16,8 +16,7 @@ import pytest
 from benchmarks import study
 
 SMALL = {
-    'bathymetry_accuracy': ({'pings': 1}, {}, 'methods>defaults>patch'),
-    'bathymetry_paper': ({'pings': 1, 'only': 'surface echoes, expected'}, {}, 'cases>*>smooth_m'),
+    'bathymetry_paper': ({'pings': 1, 'parts': ['methods']}, {}, 'methods>defaults>patch'),
     'bathymetry_sea': ({'pings': 2, 'only': 'nadir'}, {}, 'cases>nadir, terrain>rmse_m'),
     'bathymetry_surfaces': (
         {'pings': 1},

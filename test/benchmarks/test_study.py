@@ -10,8 +10,11 @@
 
 from collections.abc import Sequence
 from datetime import date
+import functools
 import json
 import os
+import runpy
+import shlex
 
 from helpers.source import ROOT
 import pytest
@@ -59,27 +62,59 @@ def test_the_file_holds_what_is_known_when_a_run_is_broken_off(monkeypatch, tmp_
     assert study.known(tmp_path / 'none') == study.known(None) == {}
 
 
+def test_a_run_is_put_beside_what_is_in_the_file(monkeypatch, tmp_path):
+    file = tmp_path / 'numbers.json'
+    run(monkeypatch, numbers, '--cases', 'a', '--out', file)
+    before = json.loads(file.read_text())['made']
+    for _ in range(2):
+        run(monkeypatch, numbers, '--cases', 'b', '--runs', 2, '--add', '--out', file)
+    assert study.known(file)['table'] == {
+        'a': {'error': 0.375, 'n': 3},
+        'b': {'error': 0.25, 'n': 2},
+    }
+    made = json.loads(file.read_text())['made']
+    assert made['date'] == before['date'] and made['command'].startswith(before['command'] + '; ')
+    assert made['command'].count(' at commit ') == 1
+
+
 def test_a_fresh_process_is_another_one_and_its_errors_arrive():
     assert study.in_fresh_process(os.getpid) != os.getpid()
     with pytest.raises(ZeroDivisionError):
         study.in_fresh_process(divmod, 1, 0)
 
 
-@pytest.mark.skipif(not (ROOT / 'docs').is_dir(), reason='reads the source tree')
-def test_every_study_of_the_docs_is_there():
-    names = set()
+def commands():
+    """Every command that a file of results names, but for where it writes."""
     for path in (ROOT / 'docs' / 'results').glob('*.json'):
         made = json.loads(path.read_text(encoding='utf-8'))['made']
         assert made.keys() == {'command', 'date', 'commit'}, path
-        words = made['command'].split()
-        if words[:2] == ['python', '-m']:
-            names.add(words[2])
-    assert names
-    for name in names:
-        path = ROOT / name.replace('.', '/')
-        path = path / '__main__.py' if path.is_dir() else path.with_suffix('.py')
-        text = path.read_text(encoding='utf-8')
-        assert 'study(' in text or 'write_json(' in text, f'{name} does not use the harness'
+        for command in made['command'].split('; '):
+            if command.startswith('python -m '):
+                yield command.removeprefix('python -m ').partition(' --out ')[0]
+
+
+@pytest.mark.filterwarnings('ignore:.*found in sys.modules')
+@pytest.mark.parametrize('command', [*commands()])
+def test_the_command_of_every_result_works(command, monkeypatch):
+    """Its study is there, and has the options and choices; nothing is run."""
+    name, *words = shlex.split(command)
+    if name == 'benchmarks.node_latency':
+        pytest.importorskip('rclpy')
+    taken = []
+
+    def of_nothing(main, **options):
+        @functools.wraps(main)
+        def nothing(**given):
+            taken.append(given)
+            return iter(())
+
+        whole(nothing, **options)
+
+    whole = study.study
+    monkeypatch.setattr(study, 'study', of_nothing)
+    monkeypatch.setattr('sys.argv', [name, *words])
+    runpy.run_module(name, run_name='__main__')
+    assert len(taken) == 1
 
 
 def test_a_file_says_how_it_was_made(tmp_path):

@@ -6,9 +6,11 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What `check` says of a node that does not do what the offline tracker does: the node is played
-by estimates that are changed on purpose."""
+"""What `check` says of a node that does not do what the offline tracker does, and what `demo`
+plays and says: nodes are played by estimates that are changed on purpose. And `warm`."""
 
+from pathlib import Path
+import re
 import shutil
 from types import SimpleNamespace
 
@@ -19,9 +21,10 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from sonar_imm_tools.cli import check as check_module  # noqa: E402
 from sonar_imm_tools.cli import checking, main  # noqa: E402
-from sonar_imm_tools.cli.check import run_checks  # noqa: E402
-from sonar_imm_tools.evaluation.judging import Check  # noqa: E402
+from sonar_imm_tools.evaluation.judging import Check, Judgement  # noqa: E402
+from sonar_imm_tools.evaluation.numbers import error, Metric  # noqa: E402
 from sonar_imm_tools.offline.run_folder import RunFolder  # noqa: E402
 from sonar_imm_tools.recordings.own_files import own_limit  # noqa: E402
 from sonar_imm_tools.recordings.reader import BagReader  # noqa: E402
@@ -151,7 +154,7 @@ def test_the_exit_code_is_one_when_anything_fell_short(dive, monkeypatch, capsys
         )
         for item in good
     ]
-    monkeypatch.setattr('sonar_imm_tools.cli.check.run_checks', lambda *_, **__: checked)
+    monkeypatch.setattr(check_module, 'run_checks', lambda *_, **__: checked)
     assert main(['check', 'diver', *(['--json'] if as_json else [])]) == int(not all(good))
     assert as_json or capsys.readouterr().out.count('FAIL') == len(good) - sum(good)
 
@@ -164,6 +167,116 @@ def test_one_recording_shows_how_far_it_is_unless_it_is_told_not_to(dive, monkey
         return SimpleNamespace(judged=lambda: 'checked')
 
     monkeypatch.setattr(checking, 'play_recording', played)
-    assert run_checks(('diver',), tmp_path, bag=dive) == ['checked']
-    run_checks(('diver',), tmp_path, bag=dive, quiet=True)
+    assert check_module.run_checks(('diver',), tmp_path, bag=dive) == ['checked']
+    check_module.run_checks(('diver',), tmp_path, bag=dive, quiet=True)
     assert asked == [False, True]
+
+
+# -- `demo`: recordings and nodes are played by small stand-ins --
+
+
+SHOWN = (error('size', 'size', card='Size error, RMS', front=True), Metric(covers=('in', 0.95)))
+
+
+@pytest.fixture
+def played(monkeypatch):
+    """What is played, by name: whether to the node; `played.bad` names those that fail."""
+
+    class Played(dict):
+        bad = ()
+
+    seen = Played()
+
+    def play(bag, system, folder, *, live, **options):
+        seen[bag.name] = live
+        checks = (Check('equal', 'x', 'x', bag.name not in seen.bad),) if live else ()
+        latency = {'p50': 1.0, 'p99': 2.0} if live else {}
+        metrics = {'size': {'rmse_m': 0.25, 'median_m': 0.2, 'p95_m': 0.5}, 'in': 0.96, 'n': 3}
+        judgement = Judgement(
+            run={'system': system, 'bag': str(bag), 'topics': {'/fix': 'fix'}}, metrics=metrics,
+            words='It went well.', shown=SHOWN, seen='{n} whales', sections=lambda: (),
+            accuracy=lambda limit: None,
+        )  # fmt: skip
+        done = checking.CheckedRecording(system, bag, folder, checks, latency, judgement)
+        return type('Done', (), {'judged': lambda self: done})()
+
+    def at_once(plays, order, jobs):
+        done = {i: plays[i]().judged() for i in order}
+        return [done[i] for i in sorted(done)]
+
+    monkeypatch.setattr(checking, 'play_recording', play)
+    monkeypatch.setattr(check_module, '_shared_out', at_once)
+    return seen
+
+
+def smallest(system):
+    sizes = {
+        bag: sum(file.stat().st_size for file in bag.rglob('*'))
+        for bag in checking.shipped_bags(system, Path())
+    }
+    return min(sizes, key=sizes.__getitem__).name
+
+
+def test_the_smallest_of_each_system_is_played_to_its_node_first(played, tmp_path, capsys):
+    assert main(['demo', '--out', str(tmp_path)]) == 0
+    systems = ('bathymetry', 'diver', 'fathometer', 'obstacle')
+    live = [name for name, to_the_node in played.items() if to_the_node]
+    assert live == [smallest(system) for system in systems] == list(played)[:4]
+    assert len(played) == sum(len(checking.shipped_bags(system, Path())) for system in systems)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(' ')[0] for line in lines] == [*systems, 'report:']
+    assert lines[1] == (
+        f'diver ({smallest("diver")}): 3 whales; Size error, RMS 0.25 m; '
+        'node and offline equal on 1 recording, errors within limits on 2'
+    )
+    report = Path(lines[-1].removeprefix('report: '))
+    assert report.parent == tmp_path and report.is_file()
+    pages = list((tmp_path / 'report_runs').glob('*.html'))
+    assert len(pages) == len(played)
+
+
+def test_one_system_and_all_of_its_recordings(played, tmp_path, capsys):
+    assert main(['demo', '--out', str(tmp_path), '--system', 'diver', '--all']) == 0
+    assert set(played) == {bag.name for bag in checking.shipped_bags('diver', Path())}
+    assert all(played.values())
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+def test_a_node_that_differs_is_named_and_fails(played, tmp_path, capsys):
+    played.bad = (smallest('diver'),)
+    assert main(['demo', '--out', str(tmp_path), '--system', 'diver']) == 1
+    out = capsys.readouterr().out
+    assert f'FAILED: {smallest("diver")}' in out and 'FAIL  equal' in out
+    assert 'FAILED: equal' in (tmp_path / 'report.html').read_text()
+
+
+# -- `warm` --
+
+
+def test_a_system_is_compiled_once(capsys):
+    assert main(['warm', 'fathometer']) == 0
+    first = capsys.readouterr().out
+    assert main(['warm', 'fathometer']) == 0
+    again = 'fathometer: nothing to compile\n'
+    assert first == again or re.match(r'fathometer: \d kernels compiled, \d loaded, ', first)
+    assert capsys.readouterr().out == again
+
+
+def test_parameters_belong_to_one_system(capsys):
+    assert main(['warm', '--set', 'sound_speed=1480']) == 2
+    assert 'need exactly one system' in capsys.readouterr().err
+
+
+def test_a_tracker_of_numpy_has_no_kernels(capsys):
+    assert main(['warm', 'obstacle']) == 0
+    assert capsys.readouterr().out == 'obstacle: nothing to compile\n'
+
+
+def test_the_smallest_recording_of_each_system_is_first(tmp_path):
+    sizes = {'a1': 30, 'a2': 10, 'b1': 20, 'a3': 50}
+    for name, size in sizes.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / 'data').write_bytes(bytes(size))
+    todo = [(tmp_path / name, name[0]) for name in sizes]
+    order, first = check_module._small_ones_first(todo)
+    assert [todo[i][0].name for i in order] == ['a2', 'b1', 'a3', 'a1'] and first == 2

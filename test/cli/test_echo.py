@@ -42,12 +42,9 @@ def test_a_state_stands_with_its_deviation_and_the_models_as_the_most_probable_o
 
 def test_any_table_is_shown_with_its_first_rows():
     columns = {
-        'range': np.arange(30, dtype='f4'),
-        'iq': np.zeros((30, 16), 'f4'),
-        'valid': np.ones(30, 'u1'),
-        'level': np.full(30, np.nan),
-        'tiny': np.full(30, 1.5e-7),
-    }
+        'range': np.arange(30, dtype='f4'), 'iq': np.zeros((30, 16), 'f4'),
+        'valid': np.ones(30, 'u1'), 'level': np.full(30, np.nan), 'tiny': np.full(30, 1.5e-7),
+    }  # fmt: skip
     lines = text_lines(table(columns), 3)
     assert lines[0] == '/diver/estimate  2023-11-14 22:13:20.250 UTC  frame map  30 rows'
     assert lines[1].split() == list(columns)

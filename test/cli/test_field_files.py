@@ -6,15 +6,16 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The road of a stranger's file: convert, info, track, export, with nothing but its name."""
+"""The road of a stranger's file: convert, info, track, export, with nothing but its name; and that
+of every row of the table of formats."""
 
-import base64
-import gzip
 from pathlib import Path
 import re
 
 from helpers.dive_scenes import legs
-from helpers.field_files import FORMATS, line, shipped_sound
+from helpers.field_files import BAGS, FORMATS, line, shipped_sound
+from helpers.report_pages import unpacked
+from helpers.source import ROOT
 import numpy as np
 import pytest
 
@@ -28,7 +29,6 @@ from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 pyais = pytest.importorskip('pyais')
 soundfile = pytest.importorskip('soundfile')
 
-BAGS = Path(__file__).resolve().parents[2] / 'bags'
 BEGIN = 1_717_149_600
 PLACE = 54.0, 10.0
 DEGREE = 111_320.0
@@ -49,7 +49,7 @@ MADE = {each.name: each for each in FORMATS}
 
 
 def test_sound_comes_back_sample_by_sample(tmp_path):
-    """That of a shipped array, from a WAV; test_every_format.py tracks it."""
+    """That of a shipped array, from a WAV; below it is tracked."""
     blocks = shipped_sound(3)
     pressure = np.concatenate([block.pressure for block in blocks])
     rate, scale = blocks[0].sample_rate, blocks[0].scale
@@ -66,8 +66,7 @@ def test_sound_comes_back_sample_by_sample(tmp_path):
 
 def drawn(report):
     """What the plots of a report are made of."""
-    packed = re.findall('H4sI[A-Za-z0-9+/=]+', report.read_text())
-    return ''.join(gzip.decompress(base64.b64decode(each)).decode() for each in packed)
+    return ''.join(map(unpacked, re.findall('H4sI[A-Za-z0-9+/=]+', report.read_text())))
 
 
 def test_obstacles_of_a_file_with_positions_lie_on_earth_in_the_report(tmp_path):
@@ -194,13 +193,9 @@ def test_the_map_of_fixes_on_earth_is_in_degrees(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
         for t, latitude, longitude in zip(times.tolist(), *degrees_of(place)):
             fix = GeodeticFix(
-                stamp_ns=t * 10**9,
-                latitude=latitude,
-                longitude=longitude,
-                height=0.0,
-                frame_id='gps',
-                covariance=np.eye(3),
-            )
+                stamp_ns=t * 10**9, latitude=latitude, longitude=longitude, height=0.0,
+                frame_id='gps', covariance=np.eye(3),
+            )  # fmt: skip
             bag.write('/fix', write_geodetic(fix, ros_message), t * 10**9)
     assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run')]) == 0
     report = tmp_path / 'report.html'
@@ -208,3 +203,58 @@ def test_the_map_of_fixes_on_earth_is_in_degrees(tmp_path):
     plots = drawn(report)
     assert '"text":"latitude"' in plots and '"text":"longitude"' in plots
     assert '"text":"x [m]"' not in plots
+
+
+# -- every row of the table of formats --
+
+
+TABLE = ROOT / 'docs' / 'reference' / 'formats.md'
+OUT = {'diver': 'csv', 'obstacle': 'geojson', 'bathymetry': 'xyz', 'fathometer': 'csv'}
+QUICK = {
+    'fathometer': ['--set', 'particles=200'],
+    'bathymetry': ['--set', 'particles_per_model=50'],
+}
+NO_NAVIGATION = ('pings.npz', 'survey.bag', 'swath.bag', 'micron.bag')
+"""What does not say where on Earth it was; of soundings not even where in metres."""
+ARRAY = ['--params', str(BAGS / 'fathometer_pressure' / 'parameters.yaml')]
+
+
+def test_each_row_of_the_table_has_a_file_here():
+    lines = TABLE.read_text().partition('## In')[2].partition('###')[0].splitlines()
+    rows = [row.split(' | ')[0].strip('| ') for row in lines if row.startswith('| ')]
+    assert rows[1:] == list(dict.fromkeys(each.row for each in FORMATS))
+
+
+@pytest.mark.parametrize('each', FORMATS, ids=lambda each: each.name)
+def test_from_a_file_to_tracks_in_a_file(tmp_path, each, capsys):
+    source, run = tmp_path / each.name, tmp_path / 'run'
+    count = {'bathymetry': 12, 'obstacle': 60}.get(each.system, 30)
+    each.make(source, line(count, each.step))
+    bag = source
+    if each.kind != 'none':
+        bag = tmp_path / 'bag'
+        words = [each.kind, str(source)] if each.kind else [str(source)]
+        options = [option.format(tmp_path) for option in each.options]
+        assert main(['convert', *words, str(bag), *options]) == 0
+        assert each.kind or 'is taken for' in capsys.readouterr().err
+    # What only describes the ground is for a tracker beside other inputs.
+    assert main(['info', str(bag)]) == (0 if each.system else 1)
+    printed = capsys.readouterr().out
+    if not each.system:
+        assert 'fits obstacle ground' in printed
+        return
+    suggested = printed.split('to track it: sonar-imm ')[1].splitlines()[0]
+    assert f'--system {each.system}' in suggested
+    words = suggested.replace('OUT_DIR', str(run)).split()
+    words += ARRAY if each.name.endswith('.wav') else QUICK.get(each.system, [])
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert f'{each.system} <- ' in printed and 'no track was made' not in printed
+    nowhere = each.name in NO_NAVIGATION
+    out = tmp_path / f'out.{"csv" if nowhere and each.system == "obstacle" else OUT[each.system]}'
+    if nowhere and each.system == 'bathymetry':
+        assert main(['export', str(run), str(out)]) == 2
+        assert 'the recording has no navigation' in capsys.readouterr().err
+        return
+    assert main(['export', str(run), str(out)]) == 0
+    assert out.stat().st_size > 100

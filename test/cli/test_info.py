@@ -6,11 +6,12 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What ``info`` recommends works."""
+"""What ``info`` recommends works; recordings in either convention of axes."""
 
 import json
 import shlex
 
+from attrs import evolve
 from helpers import marine
 from helpers.dive_bags import write_dive
 from helpers.field_files import bag_of, FORMATS, line
@@ -18,12 +19,16 @@ from helpers.source import ROOT
 import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from scipy.spatial.transform import Rotation
 
 from msg_adapters.fixes import write_geodetic
-from sonar_imm.measurements import GeodeticFix
+from msg_adapters.inputs import inputs_of
+from sonar_imm.measurements import Detections, GeodeticFix, Navigation
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import quoted
+from sonar_imm_tools.recordings.topics import fitting_topics
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
 SHIPPED = sorted(path.name for path in (ROOT / 'bags').iterdir() if path.is_dir())
@@ -211,17 +216,19 @@ def test_both_sides_of_a_side_scan(tmp_path, capsys):
     assert run(command, tmp_path / 'named', capsys, *few)['estimates'] == 4
 
 
-@pytest.mark.parametrize('name', ['usbl.csv', 'dive.gpx', 'gps.log', 'line.seg', 'frames'])
-@pytest.mark.parametrize('command', ['info', 'track'])
+KINDS = ('usbl.csv', 'dive.gpx', 'gps.log', 'line.seg', 'frames')
+
+
+@pytest.mark.parametrize(
+    'command, name', [('track', 'usbl.csv'), *(('info', name) for name in KINDS)]
+)
 def test_a_file_of_another_kind_is_named_with_the_command_that_converts_it(
     command, name, tmp_path, capsys
 ):
     (each,) = (each for each in FORMATS if each.name == name)
     each.make(tmp_path / name, line(30))
-    assert (
-        main([command, str(tmp_path / name), *([str(tmp_path / 'out')] * (command == 'track'))])
-        == 2
-    )
+    out = [str(tmp_path / 'out')] * (command == 'track')
+    assert main([command, str(tmp_path / name), *out]) == 2
     suggested = capsys.readouterr().err.split('sonar-imm convert ')[1].split(' makes one')[0]
     words = suggested.replace('OUT_BAG', str(tmp_path / 'bag')).split()
     assert main(['convert', *words, *each.options]) == 0
@@ -250,3 +257,56 @@ def test_images_of_an_interferometer_name_their_conversion(tmp_path, capsys):
     each.make(tmp_path / 'swath.bag', line(3))
     assert main(['info', str(tmp_path / 'swath.bag')]) == 1
     assert 'sonar-imm convert interferometer' in capsys.readouterr().out
+
+
+# -- a publisher in NED and FRD, and one in ENU and FLU, get the same answer: in ENU --
+
+TETHERS = ROOT / 'bags' / 'obstacle_tethers'
+TO_NED, TO_FRD = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
+
+
+def other_way(measurement):
+    """As a vehicle in NED and FRD and a sonar that counts to starboard would state it."""
+    if isinstance(measurement, Detections):
+        return evolve(measurement, bearing=-measurement.bearing)
+    if isinstance(measurement, Navigation):
+        R = TO_NED @ Rotation.from_quat(measurement.orientation).as_matrix() @ TO_FRD
+        return evolve(
+            measurement, frame_id=measurement.frame_id + '_ned',
+            position=TO_NED @ measurement.position, orientation=Rotation.from_matrix(R).as_quat(),
+            pose_covariance=None, twist_covariance=None,
+        )  # fmt: skip
+    return measurement
+
+
+@pytest.fixture
+def ned_bag(tmp_path):
+    write = {entry.measurement: (entry.name, entry.write) for entry in inputs_of('obstacle')}
+    with BagReader(TETHERS) as bag, BagWriter(tmp_path / 'ned') as out:
+        topics = {name: entry.name for name, entry in fitting_topics(bag, 'obstacle').items()}
+        for received in measurements_of(bag, 'obstacle', topics):
+            name, written = write[type(received.measurement)]
+            message = written(other_way(received.measurement), ros_message)
+            out.write(f'/{name}', message, received.measurement.stamp_ns)
+    return tmp_path / 'ned'
+
+
+def estimates(path):
+    table = np.genfromtxt(path / 'estimate.csv', delimiter=',', names=True)
+    return np.column_stack([table[name] for name in table.dtype.names])
+
+
+def test_both_conventions_give_the_same_places(ned_bag, tmp_path):
+    assert main(['track', str(TETHERS), str(tmp_path / 'enu_run'), '--order', 'stamp']) == 0
+    given = ('--set', 'world_frame_convention=ned', '--set', 'bearing_positive=starboard')
+    assert (
+        main(['track', str(ned_bag), str(tmp_path / 'ned_run'), '--order', 'stamp', *given]) == 0
+    )
+    enu, ned = estimates(tmp_path / 'enu_run'), estimates(tmp_path / 'ned_run')
+    assert len(enu) > 200
+    np.testing.assert_allclose(ned, enu, rtol=1e-5, atol=1e-5)
+
+
+def test_a_ned_frame_that_nobody_told_of_is_refused(ned_bag, tmp_path, capsys):
+    assert main(['track', str(ned_bag), str(tmp_path / 'run')]) == 0
+    assert 'north-east-down but east-north-up is expected' in capsys.readouterr().out

@@ -22,13 +22,12 @@ import pytest
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.offline.tracking import OfflineRun
 from sonar_imm_tools.recordings.reader import BagReader
-from sonar_imm_tools.recordings.topics import fitting_systems, fitting_topics, instruments
+from sonar_imm_tools.recordings.topics import fitting_topics, instruments
 from sonar_imm_tools.recordings.writer import BagWriter
 
 STATED = ('tilt_std_deg', 'spacing_std', 'sound_speed_std')
 EXACT = tuple(word for name in STATED for word in ('--set', f'{name}=0'))
 """What a simulated recording says of its array; a copy under other names says nothing."""
-COUPLED = ('--set', 'ping_coupling=0.35')
 
 
 @pytest.fixture(scope='module')
@@ -210,17 +209,6 @@ def test_bags_on_a_cluster(tmp_path, capsys):
     assert track(*bags, tmp_path / 'no', *address, '--jobs', '2') == 2
 
 
-def test_the_tracker_with_the_best_evidence_is_chosen():
-    """A ship with navigation is no obstacle tracker's, and a companion no diver's."""
-    for name, system in (
-        ('bathymetry_ship', 'bathymetry'),
-        ('fathometer_array', 'fathometer'),
-        ('obstacle_tethers', 'obstacle'),
-    ):
-        with BagReader(ROOT / 'bags' / name) as reader:
-            assert fitting_systems(reader)[0] == system
-
-
 def test_shards_share_the_bags_out(tmp_path, capsys):
     """As a Slurm array does: each command has the same bags, in any order, and makes its share."""
     bags = [write_dive(tmp_path / name, count=30, spoilt=range(k)) for k, name in enumerate('abc')]
@@ -293,13 +281,11 @@ def test_a_folder_of_tables_becomes_a_folder_of_bags(tmp_path, capsys):
     assert not (tmp_path / 'p').exists() and not (tmp_path / 'q').exists()
 
 
-@pytest.mark.parametrize('options', [EXACT, COUPLED], ids=['independent', 'coupled'])
-def test_pings_are_shared_out(swaths, tmp_path, capsys, options):
-    counts = []
+def test_pings_that_are_coupled_are_shared_out(swaths, tmp_path, capsys):
+    counts, coupled = [], ('--set', 'ping_coupling=0.35', '--json')
     for jobs in ('1', '2'):
         capsys.readouterr()
-        out = str(tmp_path / jobs)
-        assert main(['track', str(swaths), out, *options, '--jobs', jobs, '--json']) == 0
+        assert track(swaths, tmp_path / jobs, *coupled, '--jobs', jobs) == 0
         run = json.loads(capsys.readouterr().out)
         counts.append((run['counts'], run['estimates'], run['messages']))
     assert counts[0] == counts[1] and counts[0][1] == 6

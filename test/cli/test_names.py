@@ -24,9 +24,10 @@ from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import quoted
 
 NAMES = {
-    'not UTF-8': 'dive\udcff\udcfe.bag', 'lines': 'a\nb\r.bag', 'quotes': '"\'`$(x) & <b>.bag',
-    'dash': '-x', 'escapes': '\x1b[31mred\x07\x9b2J\u202e [bold]', 'longest': 'x' * 255,
-}  # fmt: skip
+    'not UTF-8, lines, quotes': 'dive\udcff\udcfe a\nb\r"\'`$(x) & <b>.bag',
+    'dash, escapes': '-\x1b[31mred\x07\x9b2J\u202e [bold]',
+    'longest': 'x' * 255,
+}
 ROWS = 'time,x,y,z\n' + ''.join(f'{1700000000 + k},{0.5 * k},{0.3 * k},0\n' for k in range(20))
 TEXTS = ('.json', '.csv', '.html', '.kml', '.gpx', '.geojson', '.yaml')
 
@@ -133,7 +134,6 @@ def test_names_of_things_that_are_not_there_are_one_sentence(name, run):
 
 
 LOCALES = {
-    'C': {'LC_ALL': 'C'},
     'C without UTF-8 mode': {'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'},
     'ASCII': {'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONIOENCODING': 'ascii'},
     'strict': {'PYTHONIOENCODING': 'utf-8:strict'},

@@ -6,14 +6,19 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""No command writes over a file of a run, of a recording or of the user."""
+"""No command writes over a file of a run, of a recording or of the user; and `view`."""
 
 import json
+from pathlib import Path
 import shutil
+import sys
+import webbrowser
 
 from helpers.commands import contents, run
 from helpers.dive_bags import write_dive
 import pytest
+
+from sonar_imm_tools.offline.run_folder import RunFolder
 
 
 @pytest.fixture(scope='module')
@@ -155,3 +160,73 @@ def test_a_file_for_rerun_keeps_them_too(here, capsys):
     before = contents(here)
     assert run('view', here / 'out', '--rerun', here / 'out' / 'estimate.csv') == 2
     assert 'choose another name' in capsys.readouterr().err and contents(here) == before
+
+
+# -- `view`: removed options, the report in the browser, the file for Rerun --
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """The addresses that a browser was asked to open, on a machine with a screen."""
+    addresses = []
+    monkeypatch.setattr(webbrowser, 'open', addresses.append)
+    monkeypatch.setenv('DISPLAY', ':0')
+    return addresses
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'sentence'),
+    [
+        ([], "Missing argument 'RESULTS|BAG'"),
+        (['nowhere.bag'], 'nowhere.bag'),
+        (['--live'], "'--live' was removed: view opens the report"),
+        (['out', '--host=0.0.0.0'], 'foxglove_bridge and config/foxglove_SYSTEM.json'),
+        (['out', '--rate', '4', '--loop'], "'--rate' was removed"),
+    ],
+)
+def test_mistakes_of_view_are_one_sentence(arguments, sentence, capsys):
+    assert run('view', *arguments) == 2
+    errors = capsys.readouterr().err
+    assert sentence in errors and errors.count('\n') == 1
+
+
+@pytest.mark.parametrize('kind', ['out', 'dive.bag'])
+def test_the_browser_gets_the_report(here, kind, capsys, opened):
+    assert run('view', here / kind, *['--browser'] * (kind == 'out')) == 0
+    (address,) = opened
+    assert address.startswith('file://') and address.endswith('/report.html')
+    assert address.removeprefix('file://') in capsys.readouterr().out
+
+
+def test_a_report_that_is_there_is_opened_as_it_is(here, opened):
+    (here / 'out' / 'report.html').write_text('made with --truth')
+    assert run('view', here / 'out') == 0
+    assert Path(opened[0].removeprefix('file://')).read_text() == 'made with --truth'
+
+
+def test_without_a_screen_it_says_where_the_report_is(here, capsys, opened, monkeypatch):
+    monkeypatch.setattr(sys, 'platform', 'linux')
+    for name in ('DISPLAY', 'WAYLAND_DISPLAY', 'BROWSER'):
+        monkeypatch.delenv(name, raising=False)
+    assert run('view', here / 'out') == 0
+    assert opened == []
+    assert capsys.readouterr().out == f'report: {here.resolve() / "out" / "report.html"}\n'
+
+
+def test_a_browser_that_does_not_start_is_no_failure(here, monkeypatch):
+    def fail(_address):
+        raise webbrowser.Error('could not locate runnable browser')
+
+    monkeypatch.setattr(webbrowser, 'open', fail)
+    monkeypatch.setenv('DISPLAY', ':0')
+    assert run('view', here / 'out') == 0
+
+
+def test_rerun_file(made, tmp_path, capsys):
+    pytest.importorskip('rerun')
+    assert run('view', made / 'out', '--rerun', tmp_path / 'dive.rrd') == 0
+    count = len(RunFolder(made / 'out').read_estimates())
+    assert f'{count} estimates written' in capsys.readouterr().out
+    assert (tmp_path / 'dive.rrd').read_bytes().startswith(b'RRF')
+    assert run('view', made / 'dive.bag', '--rerun', tmp_path / 'a.rrd') == 2
+    assert 'holds no finished run' in capsys.readouterr().err

@@ -10,15 +10,30 @@
 
 import csv
 import json
+import os
 from pathlib import Path
+import shutil
 
 from helpers.commands import contents
 from helpers.dive_bags import write_dive
+from helpers.source import ROOT
+import numpy as np
 import pytest
 
+from sonar_imm.measurements import Trace
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.offline.run_folder import RunFolder
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.reader import BagReader
 
-ROOT = Path(__file__).resolve().parents[2]
+VECTORS = ROOT / 'test' / 'vectors' / 'fathometer' / 'mvdr_traces.npz'
+DATA = Path(os.environ.get('SONAR_IMM_DATA', ROOT.parent / 'shared' / 'data')) / 'sbp_chiapas'
+LINES = (
+    'MET_EW-WE_SBP_L1_WE_20180313165838.seg',
+    'MET_EW-WE_SBP_L2_EW_20180313171011.seg',
+    'MET_EW-WE_SBP_L3_WE_20180313172145.seg',
+    'MET_NS-SN_SBP_L9_SN_20180313161627.seg',
+)
 
 
 @pytest.fixture
@@ -124,15 +139,6 @@ def test_the_shipped_parameter_file_is_understood(call, dive, tmp_path):
     assert run['estimates'] == 58 and run['smoothed'] is True
 
 
-def test_topics_are_named_and_suggested(call, tmp_path, capsys):
-    odd = write_dive(tmp_path / 'odd', topic='/usbl/pose', count=60)
-    assert main(['info', str(odd)]) == 0
-    assert '--topic fix=/usbl/pose' in capsys.readouterr().out
-    run = call('track', odd, tmp_path / 'out', '--topic', 'fix=/usbl/pose')
-    assert run['topics'] == {'/usbl/pose': 'fix'}
-    assert call('evaluate', tmp_path / 'out', '--no-report')['raw_fix']['n'] == 60
-
-
 @pytest.mark.parametrize(
     'topic, words',
     [
@@ -202,3 +208,72 @@ def test_detections_kept_in_a_bag_give_the_same_tracks(call, tmp_path, capsys):
     call('track', bag, tmp_path / 'none', '--set', 'sidelobe_db=0.0')
     assert main(['track', str(bag), str(tmp_path / 'bad'), '--set', 'sidelob_db=1.0']) == 2
     assert 'sidelob' in capsys.readouterr().err
+
+
+# -- the simulated drift of the vectors, and real lines --
+
+
+@pytest.mark.statistics
+def test_the_drift_of_the_vectors_is_tracked_as_well_as_can_be(call, tmp_path):
+    call('convert', 'traces', VECTORS, tmp_path / 'bag', '--rate', '0.0111')
+    run = call('track', tmp_path / 'bag', tmp_path / 'out')
+    assert run['system'] == 'fathometer' and run['counts']['used'] == 300
+    metrics = call('evaluate', tmp_path / 'out', '--no-report')
+    assert metrics['order_right'] >= 0.94
+    assert metrics['ospa_m'] <= 0.07
+    assert metrics['depth']['rmse_m'] <= 0.04
+    assert metrics['identity_switches'] == 0
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize('line', LINES)
+def test_the_water_bottom_of_a_real_line_is_followed(call, tmp_path, line):
+    """With what the converter tells the tracker. 4 to 6 s a line: its records are the test."""
+    pytest.importorskip('segyio')
+    if not (DATA / line).exists():
+        pytest.skip('no real recordings here; SONAR_IMM_DATA names their folder')
+    cut = ('--sample-spacing', 0.376, '--first-sample', 12, '--samples', 74, '--stack', 4)
+    call('convert', 'segy', DATA / line, tmp_path / 'bag', *cut)
+    call('track', tmp_path / 'bag', tmp_path / 'out', '--set', 'particles=3000')
+    estimates = {
+        estimate.stamp_ns: estimate.columns()
+        for estimate in RunFolder(tmp_path / 'out').read_estimates()
+    }
+    with BagReader(tmp_path / 'bag') as bag:
+        read = [received.measurement for received in measurements_of(bag, 'fathometer')]
+    traces = [item for item in read if isinstance(item, Trace)]
+    hits, ids = [], set()
+    for trace in traces:
+        # Three samples in a row above an eighth of full scale; the greatest of the next four.
+        loud = trace.amplitude > 3840.0
+        first = int(np.argmax(loud[:-2] & loud[1:-1] & loud[2:]))
+        floor = trace.depth[first + int(np.argmax(trace.amplitude[first : first + 4]))]
+        row = estimates[trace.stamp_ns]
+        away = np.abs(row['depth'] - floor)
+        hits.append(away.min() < 1.0)
+        if hits[-1]:
+            ids.add(int(row['track_id'][np.argmin(away)]))
+    assert np.mean(hits) >= 0.94 and len(ids) <= 0.012 * len(traces)
+
+
+@pytest.mark.parametrize(
+    ('setting', 'reason'),
+    [
+        ('min_separation=20.0', 'too_crowded: 12 members'),
+        ('phones=9', 'wrong_hydrophones: the array has 8 hydrophones, not 9'),
+    ],
+)
+def test_a_run_whose_records_were_all_refused_fails_with_the_reason(
+    tmp_path, capsys, setting, reason
+):
+    out = tmp_path / 'out'
+    bag = ROOT / 'bags' / 'fathometer_array'
+    assert main(['track', str(bag), str(out), '--set', setting]) == 2
+    assert f'refused: 12 ({reason}' in capsys.readouterr().err
+    assert not out.exists()
+    # Among several it is a failed run, and its reason is in the summary.
+    other = shutil.copytree(bag, tmp_path / 'other')
+    assert main(['track', str(bag), str(other), str(out), '--set', setting]) == 1
+    runs = json.loads((out / 'summary.json').read_text())['runs']
+    assert [run['state'] for run in runs] == ['failed', 'failed']
+    assert all(reason in run['failure'] for run in runs)

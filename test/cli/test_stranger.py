@@ -48,13 +48,9 @@ def config_of(own):
 @pytest.mark.parametrize('node', ['diver', '/**', '/auv/diver'])
 def test_a_recording_keeps_no_files_and_changes_no_node(bag, node, capsys):
     own = state(
-        bag,
-        'state_file: /etc/passwd',
-        'stale_after: 1.0',
-        'fix_std: 2.5',
-        'frame_id: sea',
+        bag, 'state_file: /etc/passwd', 'stale_after: 1.0', 'fix_std: 2.5', 'frame_id: sea',
         node=node,
-    )
+    )  # fmt: skip
     tracker, settings = config_of(own)
     assert (tracker.fix_std, settings.frame_id) == (2.5, 'sea')
     assert settings.state_file == '' and settings.stale_after != 1.0

@@ -39,10 +39,8 @@ PRODUCTS = (
 )  # fmt: skip
 
 
-RECORD = {
-    'system': 'bathymetry', 'bag': 'a.bag', 'topics': {},
-    'parameters': BathymetryConfig().as_dict(),
-}  # fmt: skip
+RECORD = {'system': 'bathymetry', 'bag': 'a.bag', 'topics': {}}
+RECORD['parameters'] = BathymetryConfig().as_dict()
 
 
 @pytest.fixture(scope='module')
@@ -184,6 +182,11 @@ def test_other_programs_read_the_products(lines, made, tmp_path):
         table = pyarrow.parquet.read_table(out / 'provenance.parquet')
         x, y = table['x'].to_numpy(), table['y'].to_numpy()
         half = 0.5 * table['cell'].to_numpy().max()
+        # Without --adjust the misties are part of the uncertainty; tiles are made with auto only.
+        adjustment = json.loads((out / 'adjustment.json').read_text())
+        sure = np.nanmin(read(out / 'survey.tif')[0]['uncertainty'])
+        assert (sure > adjustment['crossings']['rms_before']) == (number is not None)
+        assert (out / 'tiles').exists() == (number is None)
         # All three lie at one place, and the depths are those of the floor.
         for values, low, high in ((x, west, east), (y, south, north)):
             assert low - 2.0 < values.min() - half and values.max() + half < high + 2.0
@@ -339,23 +342,6 @@ def test_an_adjustment_that_cannot_be_read_is_made_again(lines, tmp_path, made, 
     assert work.taken() == again
 
 
-def test_a_broken_line_is_named_and_the_rest_is_made(lines, tmp_path, capsys):
-    shutil.copytree(lines, tmp_path / 'runs')
-    (tmp_path / 'runs' / 'line_001' / 'soundings.csv').write_text('stamp_ns,x\n1,2\n')
-    assert run('survey', tmp_path / 'runs', tmp_path / 'out', '--resolution', 2) == 0
-    error = capsys.readouterr().err
-    assert 'line_001: ' in error and 'no column' in error and 'Traceback' not in error
-    survey = json.loads((tmp_path / 'out' / 'survey.json').read_text())
-    failures = {line['name']: line['failure'] for line in survey['lines']}
-    assert 'no column' in failures['line_001'] and failures['line_000'] == ''
-    bands, transform, _ = read(tmp_path / 'out' / 'survey.tif')
-    assert transform.a == 2.0 and np.isfinite(bands['depth']).any()
-    assert not (tmp_path / 'out' / 'tiles').exists()  # with auto only
-    adjustment = json.loads((tmp_path / 'out' / 'adjustment.json').read_text())
-    # Without --adjust the misties are part of the uncertainty.
-    assert np.nanmin(bands['uncertainty']) > adjustment['crossings']['rms_before']
-
-
 def test_lines_with_origins_of_their_own_lie_in_one_frame(lines, made, tmp_path, capsys):
     """Each line in metres from its own first position, as lines in latitude and longitude are."""
     earth = Origin(54.3, 10.15)
@@ -499,18 +485,6 @@ def test_what_cannot_be_done_is_one_sentence_and_writes_nothing(
     error = capsys.readouterr().err
     assert words in error and 'Traceback' not in error
     assert not out.exists()
-
-
-def test_a_folder_that_is_there_stays(lines, tmp_path, capsys):
-    out = tmp_path / 'out'
-    out.mkdir()
-    (out / 'mine.txt').write_text('mine')
-    assert run('survey', lines, out) == 2 and 'is there already' in capsys.readouterr().err
-    assert run('survey', lines, out, '--resume') == 2
-    assert 'no survey' in capsys.readouterr().err
-    assert [path.name for path in out.iterdir()] == ['mine.txt']
-    assert run('survey', lines, out, '--overwrite', '--resolution', 4) == 0
-    assert (out / 'mine.txt').read_text() == 'mine'
 
 
 def test_cells_follow_depth():

@@ -50,32 +50,20 @@ def test_a_seed_decides_on_every_byte(system, name):
     assert received == sorted(received)
 
 
-def test_the_random_state_of_the_process_is_left_alone(system, scenes):
-    np.random.seed(1)
+def test_a_scene_is_in_order_has_truth_that_draws_and_tells_of_its_instruments(system):
+    np.random.seed(1)  # the state of the process, which nobody may touch
     before = np.random.get_state()[1].tobytes()
-    small_scene(system, 3)
+    config, scene = small_scene(system, 3)
     assert np.random.get_state()[1].tobytes() == before
-
-
-def test_measurements_are_received_in_order_and_after_their_stamp(system, scenes):
-    received = small_scene(system, 3)[1].measurements
-    times = [item.received_ns for item in received]
+    times = [item.received_ns for item in scene.measurements]
     assert times == sorted(times) and len(times) > 1
-    assert all(item.received_ns >= item.measurement.stamp_ns for item in received)
-
-
-def test_the_truth_is_a_table_a_stamp_that_draws(system, scenes):
-    scene = small_scene(system, 3)[1]
+    assert all(item.received_ns >= item.measurement.stamp_ns for item in scene.measurements)
     tables = [table for truth in scene.truth for table in truth.tables(scene.frame_id)]
     assert tables
     for table in tables:
         assert list(table.columns)[:3] == ['x', 'y', 'z'] and table.frame_id
         assert {len(column) for column in table.columns.values()} == {len(table.columns['x'])}
         assert all(table.columns[name].dtype == np.float32 for name in 'xyz')
-
-
-def test_the_tracker_takes_what_the_scene_tells_of_its_instruments(system, scenes):
-    config, scene = small_scene(system, 3)
     tracker = system.build(system.config_type()(**config.instruments()))
     for item in scene.measurements:
         tracker.process(item.measurement)

@@ -22,17 +22,10 @@ from sonar_imm.estimation import imm, kalman
 from sonar_imm.estimation.adaptation import AdaptiveChain
 from sonar_imm.estimation.motion import Joint, Model, Motion
 
-
-def of_bank(bank, factor=1.0):
-    """F times `factor`, Q and B of a random bank."""
-    return factor * bank['F'], bank['Q'], bank['B']
-
-
 CASES = [
     'A1_cv_cv', 'A2_cv_ct', 'A4_world16', 'A10_speedstate16', 'A12_speedstate16_hover',
     'A13_ref_only_missed', 'A14_ref_only_EM_N0_1',
 ]  # fmt: skip
-ASYMMETRIC = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
 EYE2 = np.eye(2)
 
 
@@ -194,7 +187,7 @@ def test_the_bank_is_the_readable_form(seed, T, M, n):
 def test_one_model_is_the_kalman_filter():
     rng = np.random.default_rng(5)
     bank = random_bank(rng, T=1, M=1)
-    x, P, (F, Q, B) = bank['x'][0, 0], bank['P'][0, 0], of_bank(bank)
+    x, P, F, Q, B = bank['x'][0, 0], bank['P'][0, 0], bank['F'], bank['Q'], bank['B']
     H, R, alone = bank['H'][0], bank['R'][0], np.ones((1, 1, 1))
     state = bank['x'], bank['P'], np.ones((1, 1))
     for z in rng.normal(size=(20, 2)):
@@ -205,36 +198,6 @@ def test_one_model_is_the_kalman_filter():
         found = [*state[0][0, 0], *state[1][0, 0].ravel(), log_likelihood, nis]
         due = [*x, *P.ravel(), expected.log_likelihood, expected.nis]
         np.testing.assert_allclose(found, due, rtol=1e-9, atol=1e-9)
-
-
-def test_identical_models_are_one_filter_and_the_chain_runs_free():
-    rng = np.random.default_rng(6)
-    alone = random_bank(rng, T=1, M=1)
-    bank = {key: np.repeat(alone[key], 3, axis=0) for key in ('F', 'Q', 'B')}
-    law, H, R = np.array([0.2, 0.5, 0.3]), alone['H'], alone['R'][0]
-    state = *(np.repeat(alone[key], 3, axis=1) for key in ('x', 'P')), law[None]
-    single = alone['x'], alone['P'], np.ones((1, 1))
-    for z in rng.normal(size=(100, 2)):
-        seen = z, np.repeat(H, 3, axis=1)[0], R
-        *state, _, _ = cycle(*state, ASYMMETRIC[None], *of_bank(bank, 0.9), *seen)
-        one = np.ones((1, 1, 1)), *of_bank(alone, 0.9)
-        *single, _, _ = cycle(*single, *one, z, H[0], R)
-        law = law @ ASYMMETRIC
-        np.testing.assert_allclose(state[2][0], law, atol=1e-11)
-        np.testing.assert_allclose(state[0][0, 1], single[0][0, 0], rtol=1e-7, atol=1e-7)
-    np.testing.assert_allclose(law @ ASYMMETRIC, law, atol=1e-11)
-
-
-def test_identical_rows_are_a_gpb1():
-    """Whatever came before, each model starts from the one overall mixture."""
-    bank = random_bank(np.random.default_rng(8))
-    rows, known = np.tile([0.1, 0.2, 0.3, 0.4], (1, 4, 1)), (bank['x'], bank['P'], bank['mu'])
-    x, P, c = imm.mix(*known, rows)
-    mean, covariance = imm.combine(*known, np.tile(np.eye(3), (4, 1, 1)))
-    for j in range(4):
-        np.testing.assert_allclose(x[:, j], mean, atol=1e-12)
-        np.testing.assert_allclose(P[:, j], covariance, atol=1e-12)
-    np.testing.assert_allclose(c, np.tile(rows[0, 0], (3, 1)), atol=1e-14)
 
 
 @pytest.mark.parametrize('far', [1e2, 1e4, 1e8])

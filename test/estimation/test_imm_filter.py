@@ -72,16 +72,6 @@ def test_equals_filterpy_on_an_asymmetric_chain():
         assert imm.model_probabilities == pytest.approx(peer.mu, rel=1e-10, abs=1e-12)
 
 
-def test_where_filterpy_differs_from_the_mathematics():
-    """It lets the chain rest without a measurement; ours goes to the stationary law."""
-    imm, peer = IMM(MODELS, T, **START, measurement=position(1.0)), filterpy_imm()
-    for _ in range(200):
-        imm.step(None)
-        peer.predict()
-    assert imm.model_probabilities == pytest.approx([0.8, 0.2], abs=1e-9)
-    assert peer.mu == pytest.approx([0.5, 0.5], abs=1e-12)
-
-
 class StoneSoupIMM:
     """Stone Soup has no IMM: its extended filter as the members of one written with loops."""
 

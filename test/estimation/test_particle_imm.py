@@ -89,35 +89,6 @@ def test_where_the_state_says_nothing_it_is_the_forward_algorithm(order):
             assert math.isnan(tracker.log_likelihood)
 
 
-def test_static_states_beside_models_are_a_larger_hidden_markov_model():
-    """Which of four bottoms it is never changes: twelve states, the bottoms as particles."""
-    rng, bottoms = np.random.default_rng(5), np.arange(4.0)
-    emission = rng.dirichlet(np.full(5, 0.7), (3, 4))  # of model and bottom, five kinds of echo
-    echoes = rng.integers(5, size=12)
-    likelihood = emission[:, :, echoes].reshape(12, -1).T
-    joint, log = forward(np.kron(T, np.eye(4)), likelihood, np.full(12, 1.0 / 12.0))
-    exact = joint[-1].reshape(3, 4)
-    mean = exact.sum(axis=0) @ bottoms
-    variance = exact.sum(axis=0) @ (bottoms - mean) ** 2
-    sensors = {
-        name: lambda x, z, e=e: np.log(e[x[:, 0].astype(int), z])
-        for name, e in zip('abc', emission)
-    }
-    runs = []
-    for seed in range(40):
-        tracker = ParticleIMM(
-            dict.fromkeys('abc', still), T, np.tile(bottoms, 200)[:, None], sensors,
-            np.random.default_rng(seed),
-        )  # fmt: skip
-        total = 0.0
-        for echo in echoes:
-            tracker.step(echo)
-            total += tracker.log_likelihood
-        found = tracker.estimate
-        runs.append([*tracker.model_probabilities, found.mean[0], found.covariance[0, 0], total])
-    assert close(runs, [*exact.sum(axis=1), mean, variance, log.sum()], bias=0.01)
-
-
 # -- linear Gaussian models -----------------------------------------------------------------------
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from oracles.set_particles import weigh
 import pytest
 
+from sonar_imm.estimation import set_proposals
 from sonar_imm.estimation.set_filter import LagSmoother, SetFilter
 from sonar_imm.estimation.set_model import (
     banded_transition,
@@ -26,14 +27,6 @@ from sonar_imm.estimation.set_model import (
     SetModel,
     Sets,
     Walks,
-)
-from sonar_imm.estimation.set_proposals import (
-    begin,
-    fill_walks,
-    gains,
-    standing_out,
-    walked_from,
-    WalkTables,
 )
 from sonar_imm.estimation.set_shifts import Jump, Shift
 
@@ -62,7 +55,7 @@ def record(places, sigmas, n=N, seed=None):
 def test_what_stands_out_is_each_member_without_the_others(more):
     """Also in a record that is longer than the lattice, as with a shift."""
     b = record(PLACES, SIGMAS, N + more)
-    alone, peaks = standing_out(MODEL, b, GRAM)
+    alone, peaks = set_proposals.standing_out(MODEL, b, GRAM)
     assert len(peaks.first) == len(PLACES)
     for place, sigma, low, high in zip(PLACES, SIGMAS, *peaks):
         assert low <= place < high and low + np.argmax(alone[low:high]) == place
@@ -75,20 +68,20 @@ def test_negative_members_stand_out_where_there_can_be_some():
     signed = SIGMAS * np.where(np.arange(8) % 3 == 1, -1.0, 1.0)
     b = record(PLACES, signed)
     both = evolve(MODEL, negative_probability=0.05)
-    g, peaks = gains(both, b, GRAM)
+    g, peaks = set_proposals.gains(both, b, GRAM)
     assert len(peaks.first) == 8 and g.shape == (2, N)
     for sign, low, high in zip(np.sign(signed), *peaks):
         place = low + np.argmax(g[:, low:high].max(axis=0))
         assert g[int(sign < 0), place] > 10.0 and g[int(sign > 0), place] == 0.0
-    assert len(standing_out(MODEL, b, GRAM)[1].first) < 8
+    assert len(set_proposals.standing_out(MODEL, b, GRAM)[1].first) < 8
 
 
 def test_nothing_stands_out_of_noise_and_blind_proposals_see_nothing():
-    assert not len(gains(MODEL, record(PLACES, 0.0 * SIGMAS), GRAM)[1].first)
+    assert not len(set_proposals.gains(MODEL, record(PLACES, 0.0 * SIGMAS), GRAM)[1].first)
     b, blind = record(PLACES, SIGMAS), evolve(MODEL, walk_share=0.0, birth_share=0.0)
-    g, peaks = gains(blind, b, GRAM)
+    g, peaks = set_proposals.gains(blind, b, GRAM)
     assert not len(peaks.first) and np.array_equal(g[0], 0.5 * np.square(np.maximum(b, 0.0)))
-    beginning, births = begin(blind, g, peaks)
+    beginning, births = set_proposals.begin(blind, g, peaks)
     assert beginning.decay == 1.0 and np.array_equal(beginning.elsewhere, births.running)
     assert np.diff(births.running) == pytest.approx(1.0 / N)
 
@@ -158,9 +151,9 @@ def test_walks_are_drawn_by_what_they_come_to(wide, all_sums):
     probability = np.array([[0.0, 0.25, 0.5, 0.25, 0.0], [0.3, 0.0, 0.2, 0.1, 0.4]])
     kind, centre = (np.arange(n) % 3 == 1).astype(np.int64), np.array([0, 3])
     wanted = rng.random(2 * n) < 0.6
-    tables = WalkTables(*np.full((2, 2 * n, 5), 7.0), np.full(2 * n, 7.0))
+    tables = set_proposals.WalkTables(*np.full((2, 2 * n, 5), 7.0), np.full(2 * n, 7.0))
     walks = Walks(kind, centre, probability, wide)
-    fill_walks(walks, g, share, wanted, tables, all_sums=all_sums)
+    set_proposals.fill_walks(walks, g, share, wanted, tables, all_sums=all_sums)
     for row in range(2 * n):
         sign, z = divmod(row, n)
         to = z + centre[kind[z]] + np.arange(-2, 3)
@@ -191,7 +184,7 @@ def test_every_row_from_which_a_member_walks_is_known_to_be_wanted(shift):
     expected = np.zeros((2, its.record_cells), bool)
     for offset in offsets:
         expected[0, [5 + offset, 30 + offset]] = expected[1, 399 + offset] = True
-    found = walked_from(its, sets).reshape(expected.shape)
+    found = set_proposals.walked_from(its, sets).reshape(expected.shape)
     assert (found >= expected).all()
     # What is no member counts as one in the first cell.
     assert found.sum() <= expected.sum() + len(offsets)

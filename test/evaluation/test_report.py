@@ -28,6 +28,7 @@ from scipy.stats import chi2
 
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate
+from sonar_imm_tools.evaluation import report
 from sonar_imm_tools.evaluation.diver import figures, METRICS, seen, summary_sentence
 from sonar_imm_tools.evaluation.diver.scoring import score
 from sonar_imm_tools.evaluation.diver.series import series_of, Truth
@@ -43,17 +44,6 @@ from sonar_imm_tools.evaluation.plotting import (
     thumbnail,
     THUMBNAIL_POINTS,
     WIDTH,
-)
-from sonar_imm_tools.evaluation.report import (
-    front_html,
-    LEAST_GL_POINTS,
-    MOST_GL_FIGURES,
-    page_names,
-    Part,
-    PLOTLYJS,
-    report_html,
-    Section,
-    write_report,
 )
 
 RUN = {
@@ -113,7 +103,7 @@ class Page(HTMLParser):
 
 
 def test_the_page_is_whole_small_loads_nothing_and_is_the_same_each_time():
-    text = report_html(part())
+    text = report.report_html(part())
     page = Page(text)
     assert page.loads == []
     assert page.headings[:5] == [
@@ -123,7 +113,7 @@ def test_the_page_is_whole_small_loads_nothing_and_is_the_same_each_time():
     assert unpacked(page.plotlyjs).startswith('/**\n* plotly.js')
     assert 'Refused input' in page.headings
     assert 'not &lt;b&gt;finite' in text and 'not <b>finite' not in text
-    assert text == report_html(part()) and len(text) < 3e6
+    assert text == report.report_html(part()) and len(text) < 3e6
     assert len(page.figures) == 4
     names = [trace.get('name') for trace in page.figures[0]['data']]
     assert 'truth' in names and any(str(name).startswith('track ') for name in names)
@@ -131,19 +121,21 @@ def test_the_page_is_whole_small_loads_nothing_and_is_the_same_each_time():
 
 
 def test_warnings_of_the_tracker_are_shown_and_truth_only_where_there_is_one():
-    text = report_html(part(truth=False, warnings=['fix covariances <small>']))
+    text = report.report_html(part(truth=False, warnings=['fix covariances <small>']))
     headings = Page(text).headings
     assert 'Stated uncertainty' in headings and 'Error, and the predicted error' not in headings
     assert '<li>fix covariances &lt;small&gt;</li>' in text and 'Dotted' not in text
-    assert 'Dotted: truth' in report_html(part()) and '<h2>Warnings' not in report_html(part())
+    assert 'Dotted: truth' in report.report_html(
+        part()
+    ) and '<h2>Warnings' not in report.report_html(part())
 
 
 def test_several_runs_have_a_front_page_and_a_page_each(tmp_path):
     failed = [Check('bytes', 'other', 'equal', False), Check('end', '0', '0', True)]
     parts = [part(), part(bag='/data/other.bag', checks=failed), part(bag='/data/other.bag')]
-    write_report(tmp_path / 'all.html', parts)
+    report.write_report(tmp_path / 'all.html', parts)
     pages = sorted(path.name for path in (tmp_path / 'all_runs').iterdir())
-    assert pages == ['1_my_dive_bag.html', '2_other_bag.html', '3_other_bag.html', PLOTLYJS]
+    assert pages == ['1_my_dive_bag.html', '2_other_bag.html', '3_other_bag.html', report.PLOTLYJS]
     text = (tmp_path / 'all.html').read_text()
     front = Page(text)
     # The picture is of the run with most checks.
@@ -153,19 +145,19 @@ def test_several_runs_have_a_front_page_and_a_page_each(tmp_path):
     run = (tmp_path / 'all_runs' / pages[1]).read_text()
     assert Page(run).loads == ['../all.html'] and not Page(run).plotlyjs
     assert 'other.bag' in Page(run).headings and len(run) < 3e6
-    shared = (tmp_path / 'all_runs' / PLOTLYJS).read_text()
+    shared = (tmp_path / 'all_runs' / report.PLOTLYJS).read_text()
     assert unpacked(shared.split("'")[1]).startswith('/**\n* plotly.js')
     assert len(run) + len(shared) < 3e6  # what a browser loads for a page
 
 
 def test_one_run_is_one_file(tmp_path):
-    write_report(tmp_path / 'a' / 'run.html', [part()])
+    report.write_report(tmp_path / 'a' / 'run.html', [part()])
     assert [path.name for path in (tmp_path / 'a').iterdir()] == ['run.html']
 
 
 def test_the_front_page_has_three_numbers_and_a_verdict_of_each_run():
     row = part()
-    cells = Page(front_html([row], ['page.html'])).cells
+    cells = Page(report.front_html([row], ['page.html'])).cells
     assert cells[0] == 'my <dive>.bag' and cells[1] == 'diver'
     assert cells[2].startswith('1 track of 1 diver, ')
     assert cells[3] in ('consistent', 'cautious', 'overconfident') and cells[3] == row.verdict
@@ -176,7 +168,9 @@ def test_the_front_page_has_three_numbers_and_a_verdict_of_each_run():
 
 
 def test_names_of_pages_sort_and_suit_every_file_system():
-    names = page_names([part(bag=f'/data/{name}') for name in ('a b', '../x', 'p\u00e9 "q"')] * 4)
+    names = report.page_names(
+        [part(bag=f'/data/{name}') for name in ('a b', '../x', 'p\u00e9 "q"')] * 4
+    )
     assert names[:3] == ['01_a_b.html', '02_x.html', '03_p_q_.html']
     assert names == sorted(set(names))
 
@@ -202,47 +196,47 @@ def test_a_run_with_an_origin_is_drawn_in_degrees():
 
 
 def test_a_run_without_tracks_still_makes_a_page():
-    assert 'Map' in Page(report_html(judged(series_of([])).part())).headings
+    assert 'Map' in Page(report.report_html(judged(series_of([])).part())).headings
 
 
 def test_checks_against_the_live_node_come_first():
     checks = [Check('bytes', 'equal', 'equal', True)]
-    page = Page(report_html(part(checks=checks)))
+    page = Page(report.report_html(part(checks=checks)))
     assert page.headings[1] == 'Live node against offline tracker'
     checks = [Check('position RMSE against truth', '1 m', 'at most 2 m', True)]
-    assert Page(report_html(part(checks=checks))).headings[1] == 'Error and its limit'
+    assert Page(report.report_html(part(checks=checks))).headings[1] == 'Error and its limit'
 
 
 def test_a_part_of_another_system_makes_a_page():
-    other = Part(
+    other = report.Part(
         run={**RUN, 'system': 'whale', 'bag': 'whale.bag'},
         metrics={'size': {'rmse_m': 2.0}},
         summary='A whale.',
         cards=[Card('30 m', 'Length')],
-        sections=[Section('Whale', 'Seen from the side.')],
+        sections=[report.Section('Whale', 'Seen from the side.')],
     )
-    text = report_html(other)
+    text = report.report_html(other)
     page = Page(text)
     assert page.headings.index('whale.bag') < page.headings.index('Whale')
     assert 'sonar_imm · whale tracker' in text and 'size.rmse_m' in text
-    assert 'Length' in front_html([part(), other], ['1.html', '2.html'])
+    assert 'Length' in report.front_html([part(), other], ['1.html', '2.html'])
     # A topic of another name is told with what it was read as.
     run = {**RUN, 'topics': {'/boat/fix': 'fix', '/gps': 'fix'}}
-    assert Part(run=run, metrics={}, summary='').input == '/boat/fix, /gps as fix'
+    assert report.Part(run=run, metrics={}, summary='').input == '/boat/fix, /gps as fix'
 
 
 def kinds(sizes):
     """The kinds of traces on a page with a figure of each size."""
     drawn = [go.Figure(go.Scattergl(x=list(range(n)), y=list(range(n)))) for n in sizes]
-    sections = [Section('figure', 'text', figure) for figure in drawn]
-    text = report_html(Part(run=RUN, metrics={}, summary='', sections=sections))
+    sections = [report.Section('figure', 'text', figure) for figure in drawn]
+    text = report.report_html(report.Part(run=RUN, metrics={}, summary='', sections=sections))
     return [figure['data'][0]['type'] for figure in figures_of(text)]
 
 
 def test_only_the_largest_figures_use_the_graphics_card_and_small_ones_never():
-    sizes = [LEAST_GL_POINTS + k for k in range(MOST_GL_FIGURES + 3)]
-    assert kinds(sizes) == 3 * ['scatter'] + MOST_GL_FIGURES * ['scattergl']
-    assert kinds([10, LEAST_GL_POINTS - 1]) == 2 * ['scatter']
+    sizes = [report.LEAST_GL_POINTS + k for k in range(report.MOST_GL_FIGURES + 3)]
+    assert kinds(sizes) == 3 * ['scatter'] + report.MOST_GL_FIGURES * ['scattergl']
+    assert kinds([10, report.LEAST_GL_POINTS - 1]) == 2 * ['scatter']
 
 
 def test_thinning_keeps_at_most_what_it_says():
@@ -310,14 +304,14 @@ def test_points_areas_and_figures_without_lines():
 
 def pictured(system, verdict='consistent', **run):
     run = {'system': system, 'bag': f'{system}.bag', 'topics': {}, **run}
-    sections = [Section('Map', '', line([0, 1], [0, 1]), picture=True)]
-    return Part(run=run, metrics={}, summary='', verdict=verdict, sections=sections)
+    sections = [report.Section('Map', '', line([0, 1], [0, 1]), picture=True)]
+    return report.Part(run=run, metrics={}, summary='', verdict=verdict, sections=sections)
 
 
 def test_the_front_page_has_a_picture_of_each_system_and_coloured_verdicts():
     kinds = ('diver',), ('diver', 'overconfident'), ('obstacle', 'cautious')
     parts = [pictured(*kind) for kind in kinds]
-    page = front_html(parts, ['a.html', 'b.html', 'c.html'])
+    page = report.front_html(parts, ['a.html', 'b.html', 'c.html'])
     assert page.count('<svg') == 2 and page.count('<a class="card" href="a.html">') == 1
     for verdict, count in (('consistent', 2), ('overconfident', 1), ('cautious', 2)):
         assert page.count(f'class="badge {verdict}"') == count

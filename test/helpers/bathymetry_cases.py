@@ -14,8 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from sonar_imm.acoustics import array
-from sonar_imm.measurements import Snapshot
-from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig
+from sonar_imm.measurements import Navigation, Snapshot
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig
+from sonar_imm.trackers.bathymetry.likelihood import ship_swath
+from sonar_imm.trackers.bathymetry.ping import bin_stamps
+from sonar_imm.trackers.navigation import NavigationBuffer
 
 EXACT = {'tilt_std_deg': 0.0, 'spacing_std': 0.0, 'sound_speed_std': 0.0}
 """An array and water that are known: the covariance is that of the filter."""
@@ -74,3 +77,48 @@ def floor(height, *, seed=1, stamp_ns=1_000, snr_db=25.0, H=15.0, tilt_deg=30.0,
     y[more.pop('shadow', slice(0, 0))] = circular(1, P)
     more.setdefault('noise_variance', np.ones(len(ranges)))
     return Snapshot(stamp_ns=stamp_ns, range=ranges, iq=y.astype(np.complex64), **more)
+
+
+# -- the recording of a moving ship among the vectors --
+
+START_NS = 10**18
+
+
+def motion_case():
+    with np.load(VECTORS.parent / 'bathymetry_sea' / 'motion_0.npz') as archive:
+        return dict(archive)
+
+
+def sea_config(case, **values):
+    stated = {
+        'sonar_lever': case['lever'].tolist(), 'sonar_mount_rpy_deg': case['mount_deg'].tolist(),
+        'tilt_deg': float(case['tilt_deg']), 'side': str(case['side']),
+    }  # fmt: skip
+    return BathymetryConfig(**{**EXACT, **stated, **values})
+
+
+def navigation(case):
+    return [
+        Navigation(stamp_ns=START_NS + round(t * 1e9), position=p, orientation=q, frame_id='map')
+        for t, p, q in zip(case['tn'], case['pn'], case['qn'])
+    ]
+
+
+def snapshots(case):
+    for t, parts in zip(case['t'], case['iq'].astype(np.float64)):
+        yield Snapshot(
+            stamp_ns=START_NS + round(t * 1e9), frame_id='sonar', range=case['r'],
+            iq=parts[..., 0] + 1j * parts[..., 1], sound_speed=float(case['c']),
+            noise_variance=np.full(len(case['r']), float(case['sn2'])),
+        )  # fmt: skip
+
+
+def swath_of(case, config, snapshot):
+    """The swath of one ping."""
+    poses = navigation(case)
+    buffer = NavigationBuffer(tuple(each.stamp_ns for each in poses), tuple(poses))
+    stamps = bin_stamps(snapshot, config)
+    ranges = snapshot.ranges(config.sound_speed)
+    return ship_swath(
+        config, ranges, float(case['c']), config.side, float(case['dlam']), buffer.poses(stamps)
+    )

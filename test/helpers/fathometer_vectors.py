@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from helpers.vector_files import load_vectors
 from sonar_imm.acoustics.fathometer import sediment_thickness
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimation.arrays import FloatArray
@@ -57,10 +57,9 @@ class SignedSet(NamedTuple):
     amplitude: FloatArray
 
 
-def signed_sets(folder: Path) -> Iterator[SignedSet]:
-    """All rows of fathometer_sea/signed_likelihood.npz in `folder`."""
-    with np.load(folder / 'fathometer_sea' / 'signed_likelihood.npz') as file:
-        v = {name: file[name] for name in file}
+def signed_sets() -> Iterator[SignedSet]:
+    """All rows of fathometer_sea/signed_likelihood.npz."""
+    v = load_vectors('fathometer_sea/signed_likelihood')
     n = v['response'].shape[1]
     edges = float(v['frequency_min']), float(v['frequency_max'])
     pulse = band_pulse(*edges, float(v['sound_speed']))
@@ -77,20 +76,19 @@ def signed_sets(folder: Path) -> Iterator[SignedSet]:
         yield SignedSet(model, sets, v['response'][k], log_likelihood, amplitude)
 
 
-def sediment(folder: Path) -> float:
+def sediment() -> float:
     """Largest error of the thickness, m."""
-    with np.load(folder / 'fathometer_sea' / 'sediment.npz') as file:
-        found = [
-            sediment_thickness(file['two_way_time_below_bottom'], float(speed), float(gradient))
-            for speed, gradient in zip(file['sound_speed'], file['gradient'])
-        ]
-        return float(np.abs(np.array(found) - file['thickness']).max())
+    v = load_vectors('fathometer_sea/sediment')
+    found = [
+        sediment_thickness(v['two_way_time_below_bottom'], float(speed), float(gradient))
+        for speed, gradient in zip(v['sound_speed'], v['gradient'])
+    ]
+    return float(np.abs(np.array(found) - v['thickness']).max())
 
 
-def pressure(folder: Path) -> dict[str, float]:
+def pressure() -> dict[str, float]:
     """Largest relative errors of what is made of pressure.npz, of both records."""
-    with np.load(folder / 'fathometer_sea' / 'pressure.npz') as file:
-        v = {name: file[name] for name in file}
+    v = load_vectors('fathometer_sea/pressure')
     names = ('snapshot_seconds', 'record_seconds', 'frequency_min', 'frequency_max')
     settings: dict[str, Any] = {name: float(v[name]) for name in names}
     config = FathometerConfig(

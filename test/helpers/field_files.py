@@ -9,9 +9,10 @@
 """A file of each format that goes in, made from one line: who was where and when."""
 
 from collections.abc import Callable
-from datetime import timedelta
+from datetime import datetime, timedelta, timezone
 import itertools
 import json
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ from helpers.sonar_files import (
     line_east,
     place_of,
     side_scan,
+    write_segy,
     xtf_head,
     xtf_soundings,
 )
@@ -59,6 +61,12 @@ class Spot(NamedTuple):
         return f'{moment}Z'
 
 
+def text_of(t, digits=3, pattern='%Y-%m-%d %H:%M:%S'):
+    """Seconds since 1970 as text, cut off after `digits` digits."""
+    whole = datetime.fromtimestamp(math.floor(t), timezone.utc).strftime(pattern)
+    return whole + (f'.{int(t % 1 * 10**digits + 1e-6):0{digits}d}' if digits else '')
+
+
 def line(count=80, step=1.0):
     """A dive of ever new legs, with the noise of a USBL."""
     seconds = step * np.arange(count)
@@ -67,22 +75,20 @@ def line(count=80, step=1.0):
     return [Spot(float(t), (float(x), float(y))) for t, (x, y) in zip(seconds, places)]
 
 
+def csv(path, head, rows):
+    path.write_text('\n'.join([head, *rows]) + '\n')
+
+
 def usbl_csv(path, spots):
-    rows = [
-        f'{each.time},{each.degrees[0]:.8f},{each.degrees[1]:.8f},1.2,{each.name}'
-        for each in spots
-    ]
-    path.write_text('\n'.join(['time,lat,lon,std,id', *rows]) + '\n')
+    rows = ('{},{:.8f},{:.8f},1.2,{}'.format(e.time, *e.degrees, e.name) for e in spots)
+    csv(path, 'time,lat,lon,std,id', rows)
 
 
 def vessel_csv(path, spots):
-    rows = [
-        f'{each.time},{each.degrees[0]:.8f},{each.degrees[1]:.8f},90,{30 + 0.2 * k:.2f},45,'
-        f'{each.name}'
-        for k, each in enumerate(spots)
-    ]
     head = 'time,vessel_latitude,vessel_longitude,heading,range,bearing_deg,id'
-    path.write_text('\n'.join([head, *rows]) + '\n')
+    row = '{},{:.8f},{:.8f},90,{:.2f},45,{}'
+    rows = [row.format(e.time, *e.degrees, 30 + 0.2 * k, e.name) for k, e in enumerate(spots)]
+    csv(path, head, rows)
 
 
 def of_each(spots):
@@ -119,12 +125,11 @@ def kml(path, spots):
 def geojson(path, spots):
     features = [
         {
-            'type': 'Feature',
+            'type': 'Feature', 'properties': {'time': each.time, 'id': each.name},
             'geometry': {'type': 'Point', 'coordinates': list(each.degrees[::-1])},
-            'properties': {'time': each.time, 'id': each.name},
         }
         for each in spots
-    ]
+    ]  # fmt: skip
     path.write_text(json.dumps({'type': 'FeatureCollection', 'features': features}, indent=1))
 
 
@@ -173,13 +178,13 @@ def receptions(spots):
 
 def stations(folder):
     rows = ['{},{:.9f},{:.9f}'.format(k, *place_of(*place)) for k, place in enumerate(STATIONS)]
-    (folder / 'stations.csv').write_text('\n'.join(['receiver,latitude,longitude', *rows]) + '\n')
+    csv(folder / 'stations.csv', 'receiver,latitude,longitude', rows)
 
 
 def telemetry(path, spots):
     stations(path.parent)
     rows = [f'{FIRST + t:.6f},{number},{each.name}' for _, each, number, t in receptions(spots)]
-    path.write_text('\n'.join(['time_utc,receiver,tag', *rows]) + '\n')
+    csv(path, 'time_utc,receiver,tag', rows)
 
 
 def arrivals(path, spots):
@@ -187,7 +192,7 @@ def arrivals(path, spots):
     rows = [
         f'{k},{number},{FIRST + t:.6f},{each.name}' for k, each, number, t in receptions(spots)
     ]
-    path.write_text('\n'.join(['ping,receiver,arrival_s,tag', *rows]) + '\n')
+    csv(path, 'ping,receiver,arrival_s,tag', rows)
 
 
 def shipped_sound(most=None):
@@ -214,24 +219,18 @@ def echoes(count, bins=120):
 
 
 def segy(path, spots):
-    segyio = pytest.importorskip('segyio')
-    field, rows = segyio.TraceField, echoes(max(len(spots), 1))
-    spec = segyio.spec()
-    spec.format, spec.tracecount = 1, len(spots)
-    spec.samples = np.arange(rows.shape[1], dtype=float)
-    with segyio.create(str(path), spec) as file:
-        for k, each in enumerate(spots):
-            moment = np.datetime64(each.time[:-1]).astype('datetime64[s]').astype(object)
-            latitude, longitude = each.degrees
-            file.trace[k] = rows[k].astype(np.float32)
-            file.header[k] = {
-                field.TRACE_SAMPLE_INTERVAL: 266, field.TRACE_SAMPLE_COUNT: rows.shape[1],
-                field.YearDataRecorded: moment.year, field.DayOfYear: moment.timetuple().tm_yday,
-                field.HourOfDay: moment.hour, field.MinuteOfHour: moment.minute,
-                field.SecondOfMinute: moment.second, field.SourceGroupScalar: -1000,
-                field.CoordinateUnits: 2, field.SourceX: round(3.6e6 * longitude),
-                field.SourceY: round(3.6e6 * latitude),
-            }  # fmt: skip
+    moments = [BEGIN + timedelta(seconds=each.seconds) for each in spots]
+    degrees = np.array([each.degrees for each in spots]).reshape(-1, 2)
+    write_segy(
+        path, echoes(max(len(spots), 1))[: len(spots)], TRACE_SAMPLE_INTERVAL=266,
+        YearDataRecorded=[moment.year for moment in moments],
+        DayOfYear=[moment.timetuple().tm_yday for moment in moments],
+        HourOfDay=[moment.hour for moment in moments],
+        MinuteOfHour=[moment.minute for moment in moments],
+        SecondOfMinute=[moment.second for moment in moments], SourceGroupScalar=-1000,
+        CoordinateUnits=2, SourceX=np.round(3.6e6 * degrees[:, 1]).astype(int),
+        SourceY=np.round(3.6e6 * degrees[:, 0]).astype(int),
+    )  # fmt: skip
 
 
 def traces_csv(path, spots):
@@ -240,7 +239,7 @@ def traces_csv(path, spots):
         for each, row in zip(spots, echoes(len(spots)))
         for n, value in enumerate(row)
     ]
-    path.write_text('\n'.join(['time_utc,depth,amplitude', *rows]) + '\n')
+    csv(path, 'time_utc,depth,amplitude', rows)
 
 
 def traces_npz(path, spots):
@@ -303,23 +302,14 @@ def images_bag(path, spots):
     def messages(each, stamp):
         samples = np.round(3.0 * np.sqrt(rng.exponential(size=(100, 41))))
         samples[max(round(70 - each.seconds), 1), 20] = 200.0
-        data = np.frombuffer(samples.astype('u1').tobytes(), np.uint8)
         yield '/auv/odometry', pose_at(stamp, 0.5 * each.seconds)
-        yield (
-            '/fls/image',
-            marine.make(
-                'ProjectedSonarImage',
-                header=marine.header(sec=stamp // 10**9),
-                ping_info=marine.ping_info(),
-                beam_directions=marine.vectors(
-                    np.column_stack([np.zeros(41), -np.sin(bearings), np.cos(bearings)])
-                ),
-                ranges=marine.floats(2.0 + 0.5 * np.arange(100)),
-                image=marine.make(
-                    'SonarImageData', is_bigendian=False, dtype=0, beam_count=41, data=data
-                ),
-            ),
-        )
+        directions = np.column_stack([np.zeros(41), -np.sin(bearings), np.cos(bearings)])
+        yield '/fls/image', marine.make(
+            'ProjectedSonarImage', header=marine.header(sec=stamp // 10**9),
+            ping_info=marine.ping_info(), beam_directions=marine.vectors(directions),
+            ranges=marine.floats(2.0 + 0.5 * np.arange(100)),
+            image=marine.image_data(samples.astype('u1'), 0, 41),
+        )  # fmt: skip
 
     bag_of(path, spots, messages)
 
@@ -328,28 +318,19 @@ def phases_bag(path, spots):
     iq, _ = floor(max(len(spots), 1), 2)
     count = iter(range(len(spots)))
 
-    def image(stamp, row, dtype):
-        row = np.asarray(row, np.float32)
+    def image(stamp, row):
+        row, none = np.asarray(row, np.float32), marine.floats([])
         return marine.make(
-            'RawSonarImage',
-            header=marine.header(sec=stamp // 10**9),
-            ping_info=marine.ping_info(),
-            sample_rate=0.5 * 1500.0 / 0.06,
-            samples_per_beam=len(row),
-            sample0=140,
-            tx_delays=marine.floats([]),
-            tx_angles=marine.floats([]),
-            rx_angles=marine.floats([]),
-            image=marine.make(
-                'SonarImageData', is_bigendian=False, dtype=8, beam_count=1,
-                data=np.frombuffer(row.tobytes(), np.uint8),
-            ),
+            'RawSonarImage', header=marine.header(sec=stamp // 10**9),
+            ping_info=marine.ping_info(), sample_rate=0.5 * 1500.0 / 0.06,
+            samples_per_beam=len(row), sample0=140, tx_delays=none, tx_angles=none,
+            rx_angles=none, image=marine.image_data(row, 8),
         )  # fmt: skip
 
     def messages(each, stamp):
         ping = iq[next(count), 140:]
-        yield '/sss/amplitude', image(stamp, np.abs(ping).mean(axis=1), 8)
-        yield '/sss/phase', image(stamp, np.angle(ping[:, 1] * ping[:, 0].conj()), 8)
+        yield '/sss/amplitude', image(stamp, np.abs(ping).mean(axis=1))
+        yield '/sss/phase', image(stamp, np.angle(ping[:, 1] * ping[:, 0].conj()))
 
     bag_of(path, spots, messages)
 
@@ -365,21 +346,14 @@ def cloud_bag(path, spots):
         if name not in types.types:
             types.register(get_types_from_msg(each, name))
     point, cloud = (
-        types.types['geometry_msgs/msg/Point32'],
-        types.types['sensor_msgs/msg/PointCloud'],
+        types.types[name] for name in ('geometry_msgs/msg/Point32', 'sensor_msgs/msg/PointCloud')
     )
 
     def messages(each, stamp):
         yield '/auv/odometry', pose_at(stamp, 0.5 * each.seconds)
+        seen = [point(x=60.0 - 0.5 * each.seconds, y=0.0, z=0.0)]
         header = marine.header(sec=stamp // 10**9)
-        yield (
-            '/micron/points',
-            cloud(
-                header=header,
-                points=[point(x=60.0 - 0.5 * each.seconds, y=0.0, z=0.0)],
-                channels=[],
-            ),
-        )
+        yield '/micron/points', cloud(header=header, points=seen, channels=[])
 
     bag_of(path, spots, messages)
 
@@ -440,10 +414,7 @@ FORMATS = [
     ),
     Format(
         'NMEA 0183: GGA, RMC, GLL, GNS, GST, HDT, THS, ZDA, TLL, TTM; USRTH, PSIMSSB (C, H), '
-        'PSIMSNS of a USBL',
-        'gps.log',
-        nmea,
-        'diver',
+        'PSIMSNS of a USBL', 'gps.log', nmea, 'diver',
     ),
     Format('AIS: messages 1, 2, 3, 18, 19, 27', 'harbour.nmea', ais, 'diver'),
     Format(
@@ -461,10 +432,7 @@ FORMATS = [
     Format('CSV of traces', 'traces.csv', traces_csv, 'fathometer'),
     Format('bag with sonar images, or amplitude and phase', 'survey.bag', images_bag, 'obstacle'),
     Format(
-        'bag with sonar images, or amplitude and phase',
-        'swath.bag',
-        phases_bag,
-        'bathymetry',
+        'bag with sonar images, or amplitude and phase', 'swath.bag', phases_bag, 'bathymetry',
         ('--amplitude', '/sss/amplitude', '--phase', '/sss/phase', '--element-spacing', '0.0025'),
         'interferometer',
     ),

@@ -37,7 +37,7 @@ os.execv({real!r}, [{real!r}, *sys.argv[1:]])
 
 
 @contextlib.contextmanager
-def commands(folder: Path):
+def commands(folder):
     """A folder for the head of PATH, as long as the process lives."""
     address, command = str(folder / 'socket'), folder / 'sonar-imm'
     python = sys.executable
@@ -59,7 +59,7 @@ def commands(folder: Path):
             os.killpg(server.pid, signal.SIGKILL)  # with what a page has left running
 
 
-def serve(address: str) -> None:
+def serve(address):
     from sonar_imm.trackers import SYSTEMS
     from sonar_imm_tools.cli import main
 
@@ -81,7 +81,7 @@ def serve(address: str) -> None:
                     pass
 
 
-def _answer(asking: socket.socket, main) -> None:
+def _answer(asking, main):
     """Run the command that was asked for, with its files, folder and environment."""
     code = 1
     try:

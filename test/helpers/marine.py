@@ -17,109 +17,81 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 PACKAGE = 'marine_acoustic_msgs/msg/'
 DEFINITIONS = {
-    'PingInfo': 'float32 frequency\nfloat32 sound_speed\nfloat32[] tx_beamwidths\n'
-    'float32[] rx_beamwidths',
+    'PingInfo': 'float32 frequency sound_speed; float32[] tx_beamwidths rx_beamwidths',
     'DetectionFlag': 'uint8 flag',
-    'SonarDetections': 'std_msgs/Header header\nPingInfo ping_info\nDetectionFlag[] flags\n'
-    'float32[] two_way_travel_times\nfloat32[] tx_delays\n'
-    'float32[] intensities\nfloat32[] tx_angles\nfloat32[] rx_angles',
-    'SonarRanges': 'std_msgs/Header header\nPingInfo ping_info\nDetectionFlag[] flags\n'
-    'float32[] transmit_delays\nfloat32[] intensities\n'
-    'geometry_msgs/Vector3[] beam_unit_vec\nfloat32[] ranges',
-    'Dvl': (
-        'std_msgs/Header header\nuint8 DVL_MODE_BOTTOM=1\nuint8 DVL_MODE_WATER=2\n'
-        'uint8 velocity_mode\nuint8 dvl_type\ngeometry_msgs/Vector3 velocity\n'
-        'float64[9] velocity_covar\nfloat64 altitude\nfloat64 course_gnd\nfloat64 speed_gnd\n'
-        'uint8 num_good_beams\nfloat64 sound_speed\nbool beam_ranges_valid\n'
-        'bool beam_velocities_valid\ngeometry_msgs/Vector3[] beam_unit_vec\nfloat32[] range\n'
-        'float32[] range_covar\nfloat32[] beam_quality\nfloat32[] beam_velocity\n'
-        'float32[] beam_velocity_covar\n'
-    ),
-    'SonarImageData': 'bool is_bigendian\nuint32 dtype\nuint32 beam_count\nuint8[] data',
-    'RawSonarImage': 'std_msgs/Header header\nPingInfo ping_info\nfloat32 sample_rate\n'
-    'uint32 samples_per_beam\nuint32 sample0\nfloat32[] tx_delays\n'
-    'float32[] tx_angles\nfloat32[] rx_angles\nSonarImageData image',
-    'ProjectedSonarImage': 'std_msgs/Header header\nPingInfo ping_info\n'
-    'geometry_msgs/Vector3[] beam_directions\nfloat32[] ranges\n'
-    'SonarImageData image',
-}
-
-
+    'SonarDetections': 'Header; PingInfo ping_info; DetectionFlag[] flags; float32[] '
+    'two_way_travel_times tx_delays intensities tx_angles rx_angles',
+    'SonarRanges': 'Header; PingInfo ping_info; DetectionFlag[] flags; float32[] transmit_delays '
+    'intensities; geometry_msgs/Vector3[] beam_unit_vec; float32[] ranges',
+    'Dvl': 'Header; uint8 DVL_MODE_BOTTOM=1 DVL_MODE_WATER=2 velocity_mode dvl_type; '
+    'geometry_msgs/Vector3 velocity; float64[9] velocity_covar; float64 altitude course_gnd '
+    'speed_gnd; uint8 num_good_beams; float64 sound_speed; bool beam_ranges_valid '
+    'beam_velocities_valid; geometry_msgs/Vector3[] beam_unit_vec; float32[] range range_covar '
+    'beam_quality beam_velocity beam_velocity_covar',
+    'SonarImageData': 'bool is_bigendian; uint32 dtype beam_count; uint8[] data',
+    'RawSonarImage': 'Header; PingInfo ping_info; float32 sample_rate; uint32 samples_per_beam '
+    'sample0; float32[] tx_delays tx_angles rx_angles; SonarImageData image',
+    'ProjectedSonarImage': 'Header; PingInfo ping_info; geometry_msgs/Vector3[] beam_directions; '
+    'float32[] ranges; SonarImageData image',
+}  # fmt: skip
+"""Each type stands before all its fields in a row; Header is that of std_msgs."""
 OTHERS = {
-    'oculus_interfaces/msg/Ping': 'std_msgs/Header header\nuint32 ping_id\n'
-    'uint32 ping_firing_date\nfloat64 range\nfloat64 gain_percent\nfloat64 frequency\n'
-    'float64 speed_of_sound_used\nfloat64 range_resolution\nfloat64 temperature\n'
-    'float64 pressure\nuint8 master_mode\nbool has_gains\nuint16 n_ranges\nuint16 n_beams\n'
-    'uint32 step\nuint8 sample_size\nint16[] bearings\nuint8[] ping_data',
-    'ping360_sonar_msgs/msg/SonarEcho': 'std_msgs/Header header\nfloat32 angle\nuint8 gain\n'
-    'uint16 number_of_samples\nuint16 transmit_frequency\nuint16 speed_of_sound\nuint8 range\n'
-    'uint8[] intensities',
-    'sensors/msg/SonoptixECHO': 'std_msgs/Header header\nstd_msgs/Float32MultiArray array_data',
-    'stonefish_ros2/msg/DVL': 'std_msgs/Header header\ngeometry_msgs/Vector3 velocity\n'
-    'float64[9] velocity_covariance\nfloat64 altitude',
-    'dave_interfaces/msg/DVLTarget': 'string type\nfloat64 range',
-    'dave_interfaces/msg/DVL': 'std_msgs/Header header\nstring type\nDVLTarget target\n'
+    'oculus_interfaces/msg/Ping': 'Header; uint32 ping_id ping_firing_date; float64 range '
+    'gain_percent frequency speed_of_sound_used range_resolution temperature pressure; uint8 '
+    'master_mode; bool has_gains; uint16 n_ranges n_beams; uint32 step; uint8 sample_size; '
+    'int16[] bearings; uint8[] ping_data',
+    'ping360_sonar_msgs/msg/SonarEcho': 'Header; float32 angle; uint8 gain; uint16 '
+    'number_of_samples transmit_frequency speed_of_sound; uint8 range; uint8[] intensities',
+    'sensors/msg/SonoptixECHO': 'Header; std_msgs/Float32MultiArray array_data',
+    'stonefish_ros2/msg/DVL': 'Header; geometry_msgs/Vector3 velocity; float64[9] '
+    'velocity_covariance; float64 altitude',
+    'dave_interfaces/msg/DVLTarget': 'string type; float64 range',
+    'dave_interfaces/msg/DVL': 'Header; string type; DVLTarget target; '
     'geometry_msgs/TwistWithCovariance velocity',
-    'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score\n',
-    'vision_msgs/msg/ObjectHypothesisWithPose': (
-        'vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n'
-    ),
-    'vision_msgs/msg/BoundingBox3D': 'geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n',
-    'vision_msgs/msg/Detection3D': (
-        'std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n'
-        'vision_msgs/BoundingBox3D bbox\nstring id\n'
-    ),
-    'vision_msgs/msg/Detection3DArray': (
-        'std_msgs/Header header\nvision_msgs/Detection3D[] detections\n'
-    ),
-    'geographic_msgs/msg/GeoPoint': 'float64 latitude\nfloat64 longitude\nfloat64 altitude\n',
-    'geographic_msgs/msg/GeoPose': (
-        'geographic_msgs/GeoPoint position\ngeometry_msgs/Quaternion orientation\n'
-    ),
-    'geographic_msgs/msg/GeoPoseWithCovariance': (
-        'geographic_msgs/GeoPose pose\nfloat64[36] covariance\n'
-    ),
-    'geographic_msgs/msg/GeoPointStamped': (
-        'std_msgs/Header header\ngeographic_msgs/GeoPoint position\n'
-    ),
-    'geographic_msgs/msg/GeoPoseStamped': (
-        'std_msgs/Header header\ngeographic_msgs/GeoPose pose\n'
-    ),
-    'geographic_msgs/msg/GeoPoseWithCovarianceStamped': (
-        'std_msgs/Header header\ngeographic_msgs/GeoPoseWithCovariance pose\n'
-    ),
-    'marine_interfaces/msg/SonarInfo': (
-        'std_msgs/Header header\nstring sonar_model\nfloat32[] pulse_lengths\n'
-        'float32[] bandwidths\nuint8[] tx_signal_types\nuint8 intensity_quantity\n'
-        'uint8 intensity_scale\nuint8 intensity_reference\nfloat32 scale\nfloat32 offset\n'
-        'uint8 tvg_model\nfloat32 tvg_absorption_db_per_km\nfloat32 source_level_db\n'
-    ),
-    'seatrac_interfaces/msg/ModemRec': (
-        'std_msgs/Header header\nuint8 msg_id\nbool position_flt_error\nuint8 src_id\n'
-        'int16 attitude_yaw\nint16 depth_local\nuint16 vos\nbool includes_range\n'
-        'uint16 range_dist\nbool includes_usbl\nint16 usbl_azimuth\nint16 usbl_elevation\n'
-        'int16 usbl_fit_error\nbool includes_position\nint16 position_easting\n'
-        'int16 position_northing\nint16 position_depth\n'
-    ),
-    'acomms_msgs/msg/UsblData': (
-        'std_msgs/Header header\nfloat64 current_time\nfloat64 measurement_time\n'
-        'int32 remote_address\ngeometry_msgs/Vector3 xyz\ngeometry_msgs/Vector3 enu\n'
-        'geometry_msgs/Quaternion orientation\nfloat64 propagation_time\nfloat64 rssi\n'
-        'int32 integrity\nfloat64 accuracy\n'
-    ),
-    'stonefish_ros2/msg/BeaconInfo': (
-        'std_msgs/Header header\nuint8 beacon_id\nfloat32 range\nfloat32 azimuth\n'
-        'float32 elevation\ngeometry_msgs/Point relative_position\n'
-        'geometry_msgs/Quaternion local_orientation\nfloat32 local_depth\n'
-    ),
-}
+    'vision_msgs/msg/ObjectHypothesis': 'string class_id; float64 score',
+    'vision_msgs/msg/ObjectHypothesisWithPose': 'vision_msgs/ObjectHypothesis hypothesis; '
+    'geometry_msgs/PoseWithCovariance pose',
+    'vision_msgs/msg/BoundingBox3D': 'geometry_msgs/Pose center; geometry_msgs/Vector3 size',
+    'vision_msgs/msg/Detection3D': 'Header; vision_msgs/ObjectHypothesisWithPose[] results; '
+    'vision_msgs/BoundingBox3D bbox; string id',
+    'vision_msgs/msg/Detection3DArray': 'Header; vision_msgs/Detection3D[] detections',
+    'geographic_msgs/msg/GeoPoint': 'float64 latitude longitude altitude',
+    'geographic_msgs/msg/GeoPose': 'geographic_msgs/GeoPoint position; geometry_msgs/Quaternion '
+    'orientation',
+    'geographic_msgs/msg/GeoPoseWithCovariance': 'geographic_msgs/GeoPose pose; float64[36] '
+    'covariance',
+    'geographic_msgs/msg/GeoPointStamped': 'Header; geographic_msgs/GeoPoint position',
+    'geographic_msgs/msg/GeoPoseStamped': 'Header; geographic_msgs/GeoPose pose',
+    'geographic_msgs/msg/GeoPoseWithCovarianceStamped': 'Header; '
+    'geographic_msgs/GeoPoseWithCovariance pose',
+    'marine_interfaces/msg/SonarInfo': 'Header; string sonar_model; float32[] pulse_lengths '
+    'bandwidths; uint8[] tx_signal_types; uint8 intensity_quantity intensity_scale '
+    'intensity_reference; float32 scale offset; uint8 tvg_model; float32 '
+    'tvg_absorption_db_per_km source_level_db',
+    'seatrac_interfaces/msg/ModemRec': 'Header; uint8 msg_id; bool position_flt_error; uint8 '
+    'src_id; int16 attitude_yaw depth_local; uint16 vos; bool includes_range; uint16 range_dist; '
+    'bool includes_usbl; int16 usbl_azimuth usbl_elevation usbl_fit_error; bool '
+    'includes_position; int16 position_easting position_northing position_depth',
+    'acomms_msgs/msg/UsblData': 'Header; float64 current_time measurement_time; int32 '
+    'remote_address; geometry_msgs/Vector3 xyz enu; geometry_msgs/Quaternion orientation; '
+    'float64 propagation_time rssi; int32 integrity; float64 accuracy',
+    'stonefish_ros2/msg/BeaconInfo': 'Header; uint8 beacon_id; float32 range azimuth elevation; '
+    'geometry_msgs/Point relative_position; geometry_msgs/Quaternion local_orientation; float32 '
+    'local_depth',
+}  # fmt: skip
 """Messages of single drivers and simulators; of the DVL without their beams, of SonarInfo without
 its calibration and curves."""
 
 
 def definitions():
     """All of them, by full names."""
-    return {PACKAGE + name: text for name, text in DEFINITIONS.items()} | OTHERS
+    given = {PACKAGE + name: text for name, text in DEFINITIONS.items()} | OTHERS
+    return {name: _text(fields) for name, fields in given.items()}
+
+
+def _text(fields):
+    rows = [row.split() for row in fields.replace('Header;', 'std_msgs/Header header;').split(';')]
+    return ''.join(f'{kind} {name}\n' for kind, *names in rows for name in names)
 
 
 @cache
@@ -143,21 +115,13 @@ def make(name, **fields):
 
 
 def header(sec=100, frame_id='sonar'):
-    return make(
-        'std_msgs/msg/Header',
-        frame_id=frame_id,
-        stamp=make('builtin_interfaces/msg/Time', sec=sec, nanosec=5),
-    )
+    stamp = make('builtin_interfaces/msg/Time', sec=sec, nanosec=5)
+    return make('std_msgs/msg/Header', frame_id=frame_id, stamp=stamp)
 
 
 def ping_info(sound_speed=1500.0):
-    return make(
-        'PingInfo',
-        frequency=450e3,
-        sound_speed=sound_speed,
-        tx_beamwidths=floats([]),
-        rx_beamwidths=floats([]),
-    )
+    widths = {'tx_beamwidths': floats([]), 'rx_beamwidths': floats([])}
+    return make('PingInfo', frequency=450e3, sound_speed=sound_speed, **widths)
 
 
 def vectors(rows):
@@ -166,31 +130,28 @@ def vectors(rows):
     ]
 
 
+def image_data(samples, dtype, beams=1):
+    """The samples of an image as bytes; dtype: 0 for uint8, 8 for float32."""
+    data = np.frombuffer(samples.tobytes(), np.uint8)
+    given = {'is_bigendian': False, 'dtype': dtype, 'beam_count': beams}
+    return make('SonarImageData', data=data, **given)
+
+
 def sonar_ranges(beams, ranges, flags=(), intensities=(), **head):
     return make(
-        'SonarRanges',
-        header=header(**head),
-        ping_info=ping_info(),
-        flags=[make('DetectionFlag', flag=flag) for flag in flags],
-        transmit_delays=floats([]),
-        intensities=floats(intensities),
-        beam_unit_vec=vectors(beams),
-        ranges=floats(ranges),
-    )
+        'SonarRanges', header=header(**head), ping_info=ping_info(), transmit_delays=floats([]),
+        flags=[make('DetectionFlag', flag=flag) for flag in flags], ranges=floats(ranges),
+        intensities=floats(intensities), beam_unit_vec=vectors(beams),
+    )  # fmt: skip
 
 
 def sonar_detections(times, rx_angles, flags=(), intensities=(), sound_speed=1500.0, **head):
     return make(
-        'SonarDetections',
-        header=header(**head),
-        ping_info=ping_info(sound_speed),
-        flags=[make('DetectionFlag', flag=flag) for flag in flags],
-        two_way_travel_times=floats(times),
-        tx_delays=floats([]),
-        intensities=floats(intensities),
-        tx_angles=floats([]),
-        rx_angles=floats(rx_angles),
-    )
+        'SonarDetections', header=header(**head), ping_info=ping_info(sound_speed),
+        flags=[make('DetectionFlag', flag=flag) for flag in flags], tx_delays=floats([]),
+        two_way_travel_times=floats(times), intensities=floats(intensities),
+        tx_angles=floats([]), rx_angles=floats(rx_angles),
+    )  # fmt: skip
 
 
 def sent(message):
@@ -241,13 +202,6 @@ def _zero(name):
             made.append([])
         else:
             kind = detail[0]
-            made.append(
-                ''
-                if kind == 'string'
-                else 0.0
-                if 'float' in kind
-                else False
-                if kind == 'bool'
-                else 0
-            )
+            zeros = {'string': '', 'bool': False, 'float32': 0.0, 'float64': 0.0}
+            made.append(zeros.get(kind, 0))
     return store.types[name](*made)

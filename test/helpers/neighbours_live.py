@@ -11,7 +11,6 @@
 Prints one line of JSON: how many messages each input took and refused, and what came out.
 """
 
-from functools import partial
 import json
 import sys
 
@@ -39,65 +38,50 @@ def place(step):
     return np.array([20.0 + 0.5 * step, 10.0, -5.0])
 
 
+def xyz(kind, place):
+    return make(f'geometry_msgs/msg/{kind}', **dict(zip('xyz', map(float, place))))
+
+
 def geo_point(step):
-    latitude, longitude, altitude = ORIGIN.geodetic(place(step))
-    return make(
-        'geographic_msgs/msg/GeoPoint', latitude=latitude, longitude=longitude, altitude=altitude
-    )
+    degrees = dict(zip(('latitude', 'longitude', 'altitude'), ORIGIN.geodetic(place(step))))
+    return make('geographic_msgs/msg/GeoPoint', **degrees)
 
 
-def point_stamped(step):
-    return make(
-        'geographic_msgs/msg/GeoPointStamped', header=header(step), position=geo_point(step)
-    )
+def geo_pose(step):
+    return make('geographic_msgs/msg/GeoPose', position=geo_point(step))
 
 
-def pose_stamped(step):
-    pose = make('geographic_msgs/msg/GeoPose', position=geo_point(step))
-    return make('geographic_msgs/msg/GeoPoseStamped', header=header(step), pose=pose)
-
-
-def pose_with_covariance(step):
-    pose = make('geographic_msgs/msg/GeoPose', position=geo_point(step))
-    pose = make(
-        'geographic_msgs/msg/GeoPoseWithCovariance', pose=pose, covariance=np.eye(6).ravel()
-    )
-    return make('geographic_msgs/msg/GeoPoseWithCovarianceStamped', header=header(step), pose=pose)
+def sure_pose(step):
+    covariance = np.eye(6).ravel()
+    kind = 'geographic_msgs/msg/GeoPoseWithCovariance'
+    return {'pose': make(kind, pose=geo_pose(step), covariance=covariance)}
 
 
 def modem(step):
     east, north, up = place(step)
-    return make(
-        'seatrac_interfaces/msg/ModemRec', header=header(step), src_id=3, includes_position=True,
-        position_easting=round(10.0 * east), position_northing=round(10.0 * north),
-        position_depth=round(-10.0 * up),
-    )  # fmt: skip
+    return {
+        'src_id': 3, 'includes_position': True, 'position_easting': round(10.0 * east),
+        'position_northing': round(10.0 * north), 'position_depth': round(-10.0 * up),
+    }  # fmt: skip
 
 
 def usbl(step):
-    enu = make('geometry_msgs/msg/Vector3', **dict(zip('xyz', place(step))))
-    return make(
-        'acomms_msgs/msg/UsblData', header=header(step), enu=enu, remote_address=3, accuracy=1.0
-    )
+    return {'enu': xyz('Vector3', place(step)), 'remote_address': 3, 'accuracy': 1.0}
 
 
 def beacon(step):
     at = place(step) * (1.0, -1.0, -1.0)  # forward is east here: starboard is south
-    point = make('geometry_msgs/msg/Point', **dict(zip('xyz', at)))
-    return make(
-        'stonefish_ros2/msg/BeaconInfo', header=header(step), beacon_id=3, relative_position=point
-    )
+    return {'beacon_id': 3, 'relative_position': xyz('Point', at)}
 
 
 def detections(step):
-    point = make('geometry_msgs/msg/Point', x=30.0, y=2.0, z=1.0)
-    pose = make(
-        'geometry_msgs/msg/PoseWithCovariance', pose=make('geometry_msgs/msg/Pose', position=point)
-    )
+    point = xyz('Point', (30.0, 2.0, 1.0))
+    pose = make('geometry_msgs/msg/Pose', position=point)
+    pose = make('geometry_msgs/msg/PoseWithCovariance', pose=pose)
     result = make('vision_msgs/msg/ObjectHypothesisWithPose', pose=pose)
     seen = make('vision_msgs/msg/Detection3D', header=header(step), results=[result])
     seen.bbox.center.position = point
-    return make('vision_msgs/msg/Detection3DArray', header=header(step), detections=[seen])
+    return {'detections': [seen]}
 
 
 MARINE = 'marine_acoustic_msgs/msg/'
@@ -108,124 +92,80 @@ SAMPLES[30, 4] = 250
 
 
 def vectors(bearings):
-    return [
-        make('geometry_msgs/msg/Vector3', x=float(np.cos(b)), y=float(np.sin(b))) for b in bearings
-    ]
+    return [xyz('Vector3', (np.cos(b), np.sin(b), 0.0)) for b in bearings]
 
 
-def ping_info():
-    return make(MARINE + 'PingInfo', frequency=450e3, sound_speed=1500.0)
+def ping(**values):
+    info = make(MARINE + 'PingInfo', frequency=450e3, sound_speed=1500.0)
+    return {'ping_info': info, **values}
 
 
-def samples():
-    return make(MARINE + 'SonarImageData', beam_count=9, data=SAMPLES.tobytes())
-
-
-def projected(step):
-    return make(
-        MARINE + 'ProjectedSonarImage', header=header(step), ping_info=ping_info(),
-        beam_directions=vectors(BEARINGS), ranges=1.0 + 0.5 * np.arange(60), image=samples(),
-    )  # fmt: skip
-
-
-def raw(step):
-    return make(
-        MARINE + 'RawSonarImage', header=header(step), ping_info=ping_info(), sample_rate=1500.0,
-        samples_per_beam=60, rx_angles=BEARINGS, image=samples(),
-    )  # fmt: skip
+def image(**values):
+    data = make(MARINE + 'SonarImageData', beam_count=9, data=SAMPLES.tobytes())
+    return ping(image=data, **values)
 
 
 def oculus(step):
-    return make(
-        'oculus_interfaces/msg/Ping', header=header(step), range_resolution=0.5, n_ranges=60,
-        n_beams=9, step=9, sample_size=1, bearings=np.linspace(-2000, 2000, 9).astype(np.int16),
-        ping_data=SAMPLES.tobytes(),
-    )  # fmt: skip
+    return {
+        'range_resolution': 0.5, 'n_ranges': 60, 'n_beams': 9, 'step': 9, 'sample_size': 1,
+        'bearings': np.linspace(-2000, 2000, 9).astype(np.int16), 'ping_data': SAMPLES.tobytes(),
+    }  # fmt: skip
 
 
 def ping360(step):
-    return make(
-        'ping360_sonar_msgs/msg/SonarEcho',
-        header=header(step),
-        angle=0.05 * abs(10 - step),  # it turns back once, which ends a sweep
-        range=30,
-        intensities=SAMPLES[:, 4].tobytes(),
-    )
+    angle = 0.05 * abs(10 - step)  # it turns back once, which ends a sweep
+    return {'angle': angle, 'range': 30, 'intensities': SAMPLES[:, 4].tobytes()}
 
 
 def sonoptix(step):
     dims = [make('std_msgs/msg/MultiArrayDimension', size=n) for n in SAMPLES.shape]
     layout = make('std_msgs/msg/MultiArrayLayout', dim=dims)
     data = make('std_msgs/msg/Float32MultiArray', layout=layout, data=SAMPLES.ravel())
-    return make('sensors/msg/SonoptixECHO', header=header(step), array_data=data)
+    return {'array_data': data}
 
 
 def sonar_info(step):
-    return make(
-        'marine_interfaces/msg/SonarInfo', header=header(step), intensity_quantity=3,
-        intensity_scale=1, pulse_lengths=[4e-4], tx_signal_types=[1],
-    )  # fmt: skip
-
-
-def sonar_detections(step):
-    return make(
-        MARINE + 'SonarDetections', header=header(step), ping_info=ping_info(),
-        two_way_travel_times=[0.04], rx_angles=[0.1],
-    )  # fmt: skip
-
-
-def sonar_ranges(step):
-    return make(
-        MARINE + 'SonarRanges', header=header(step), ping_info=ping_info(),
-        beam_unit_vec=vectors([0.1]), ranges=[30.0],
-    )  # fmt: skip
-
-
-def dvl(type_name, step):
-    return make(type_name, header=header(step), altitude=12.0)
-
-
-def dave_dvl(step):
-    target = make('dave_interfaces/msg/DVLTarget', type='bottom', range=12.0)
-    return make('dave_interfaces/msg/DVL', header=header(step), target=target)
+    return {
+        'intensity_quantity': 3, 'intensity_scale': 1, 'pulse_lengths': [4e-4],
+        'tx_signal_types': [1],
+    }  # fmt: skip
 
 
 GEODETIC = {'origin': [ORIGIN.latitude, ORIGIN.longitude, 0.0]}
 FIXED = {'vessel': 'fixed'}
+SCREEN = {'image_far_range': 30.0, 'image_fov_deg': 40.0}
+PICTURES = {'input_types': ['image=sensor_msgs/msg/Image']}
 CASES = {
-    'geographic_msgs/msg/GeoPointStamped': (DiverNode, 'fix', point_stamped, GEODETIC),
-    'geographic_msgs/msg/GeoPoseStamped': (DiverNode, 'fix', pose_stamped, GEODETIC),
-    'geographic_msgs/msg/GeoPoseWithCovarianceStamped': (
-        *(DiverNode, 'fix', pose_with_covariance),
-        GEODETIC,
-    ),
+    'geographic_msgs/msg/GeoPointStamped':
+        (DiverNode, 'fix', lambda step: {'position': geo_point(step)}, GEODETIC),
+    'geographic_msgs/msg/GeoPoseStamped':
+        (DiverNode, 'fix', lambda step: {'pose': geo_pose(step)}, GEODETIC),
+    'geographic_msgs/msg/GeoPoseWithCovarianceStamped': (DiverNode, 'fix', sure_pose, GEODETIC),
     'seatrac_interfaces/msg/ModemRec': (DiverNode, 'relative', modem, FIXED),
     'acomms_msgs/msg/UsblData': (DiverNode, 'relative', usbl, FIXED),
     'stonefish_ros2/msg/BeaconInfo': (DiverNode, 'relative', beacon, FIXED),
     'vision_msgs/msg/Detection3DArray': (ObstacleNode, 'detections', detections, {}),
-    MARINE + 'SonarDetections': (ObstacleNode, 'detections', sonar_detections, {}),
-    MARINE + 'SonarRanges': (ObstacleNode, 'detections', sonar_ranges, {}),
-    **{
-        name: (ObstacleNode, 'altitude', partial(dvl, name), {})
-        for name in (MARINE + 'Dvl', 'stonefish_ros2/msg/DVL')
-    },
-    'dave_interfaces/msg/DVL': (ObstacleNode, 'altitude', dave_dvl, {}),
-    MARINE + 'ProjectedSonarImage': (FlsDetectorNode, 'image', projected, {}),
-    MARINE + 'RawSonarImage': (FlsDetectorNode, 'image', raw, {}),
+    MARINE + 'SonarDetections': (ObstacleNode, 'detections', lambda step: ping(
+        two_way_travel_times=[0.04], rx_angles=[0.1]), {}),
+    MARINE + 'SonarRanges': (ObstacleNode, 'detections', lambda step: ping(
+        beam_unit_vec=vectors([0.1]), ranges=[30.0]), {}),
+    **dict.fromkeys((MARINE + 'Dvl', 'stonefish_ros2/msg/DVL'), (
+        ObstacleNode, 'altitude', lambda step: {'altitude': 12.0}, {})),
+    'dave_interfaces/msg/DVL': (ObstacleNode, 'altitude', lambda step: {
+        'target': make('dave_interfaces/msg/DVLTarget', type='bottom', range=12.0)}, {}),
+    MARINE + 'ProjectedSonarImage': (FlsDetectorNode, 'image', lambda step: image(
+        beam_directions=vectors(BEARINGS), ranges=1.0 + 0.5 * np.arange(60)), {}),
+    MARINE + 'RawSonarImage': (FlsDetectorNode, 'image', lambda step: image(
+        sample_rate=1500.0, samples_per_beam=60, rx_angles=BEARINGS), {}),
     'oculus_interfaces/msg/Ping': (FlsDetectorNode, 'image', oculus, {}),
     'ping360_sonar_msgs/msg/SonarEcho': (FlsDetectorNode, 'image', ping360, {}),
-    'sensors/msg/SonoptixECHO': (
-        *(FlsDetectorNode, 'image', sonoptix),
-        {'image_far_range': 30.0, 'image_fov_deg': 40.0},
-    ),
-    'marine_interfaces/msg/SonarInfo': (
-        *(FlsDetectorNode, 'sonar_info', sonar_info),
-        {'input_types': ['image=sensor_msgs/msg/Image']},
-    ),
-}
+    'sensors/msg/SonoptixECHO': (FlsDetectorNode, 'image', sonoptix, SCREEN),
+    'marine_interfaces/msg/SonarInfo': (FlsDetectorNode, 'sonar_info', sonar_info, PICTURES),
+}  # fmt: skip
+"""Of each type the node, the input, its fields beside the header, and parameters."""
 
 
-def run(type_name, kind, name, message_of, settings):
+def run(type_name, kind, name, fields, settings):
     """Publish `STEPS` messages to a node of its own, each when the one before is answered."""
     types = [f'{name}={type_name}', *settings.get('input_types', [])]
     quality = lockstep_qos()
@@ -241,13 +181,12 @@ def run(type_name, kind, name, message_of, settings):
         if in_degrees:
             places = bench.listen(message_class('sensor_msgs/msg/NavSatFix'), '/diver/geo')
             bench.spin_until(lambda: node.count_subscribers('/diver/geo'))
-        publisher = bench.peer.create_publisher(message_class(type_name), f'/{name}', quality)
-        bench.spin_until(lambda: publisher.get_subscription_count())
+        publisher = bench.publisher(type_name, f'/{name}', quality)
         for step in range(STEPS):
-            publisher.publish(message_of(step))
+            publisher.publish(make(type_name, header=header(step), **fields(step)))
             bench.spin_until(lambda step=step: node.answer()['messages'] > step)
         if in_degrees:
-            bench.spin_until(lambda: places, 20.0)
+            bench.spin_until(lambda: places)
         return {**node.answer(), **last(places)}
     finally:
         bench.close()

@@ -6,16 +6,27 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""A small real system, the walker, and a bench to run its node on: one process, one executor."""
+"""A bench to run nodes on, one process and one executor, and the walker, a small real system."""
 
 import contextlib
 import threading
 import time
 
+import numpy as np
 import pytest
 import rclpy
+from sensor_msgs.msg import PointCloud2
 
 from helpers import walker
+from msg_adapters.estimates import read_estimate
+from msg_adapters.fixes import write_fix
+from msg_adapters.table import decode_table
+from sonar_imm.measurements import Fix
+from sonar_imm.nodes.base import TrackerNode
+from sonar_imm.nodes.messages import make, message_class
+from sonar_imm.nodes.qos import latched_qos, lockstep_qos
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.writer import BagWriter
 from sonar_imm_tools.replay.harness import reserved_domain_id
 from sonar_imm_tools.replay.link import Link
 
@@ -72,6 +83,21 @@ class Bench:
         self.peer.create_subscription(message_type, topic, received.append, qos)
         return received
 
+    def publisher(self, kind, topic, qos=None):
+        """A publisher of a type or its name that is heard."""
+        cls = message_class(kind) if isinstance(kind, str) else kind
+        made = self.peer.create_publisher(cls, topic, qos or lockstep_qos())
+        self.spin_until(made.get_subscription_count)
+        return made
+
+    def send(self, node, publisher, *messages):
+        """Publish one after another, each when the node has taken the one before."""
+        received = node._meter.received
+        for message in messages:
+            before = received.total()
+            publisher.publish(message)
+            self.spin_until(lambda want=before: received.total() > want)
+
     def call(self, service_type, name, request):
         client = self.peer.create_client(service_type, name)
         self.spin_until(client.service_is_ready)
@@ -91,12 +117,12 @@ def make_bench():
     """Make benches, each with ROS arguments as on a command line; all are closed at the end."""
     with contextlib.ExitStack() as stack:
 
-        def make(*args):
+        def begin(*args):
             bench = Bench(args)
             stack.callback(bench.close)
             return bench
 
-        yield make
+        yield begin
 
 
 @pytest.fixture
@@ -111,3 +137,79 @@ def domain(monkeypatch):
 def link(domain):
     with Link('listener', domain_id=domain) as link:
         yield link
+
+
+# -- the node of the walker with everything connected to it, and fixes to send to it --
+
+FIX = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+SECOND = 10**9
+
+
+def a_fix(seconds, x=1.0, y=2.0, frame_id='map'):
+    place = {'position': (x, y, 0.0), 'covariance': np.diag([4.0, 9.0]), 'frame_id': frame_id}
+    return write_fix(Fix(stamp_ns=round(seconds * SECOND), **place), make)
+
+
+class Rig:
+    """A walker node with everything connected to it."""
+
+    def __init__(self, bench, *, publish=FIX, qos=10, prefix='', name='walker'):
+        self.bench = bench
+        self.node = bench.add(TrackerNode('walker', context=bench.context))
+        self.name = f'{prefix}/{name}'
+        self.estimates = bench.listen(PointCloud2, f'{self.name}/estimate', lockstep_qos())
+        self.answers = bench.listen(PointCloud2, f'{self.name}/processed', latched_qos())
+        self.fix = bench.peer.create_publisher(message_class(publish), f'{prefix}/fix', qos)
+        bench.spin_until(lambda: self.answers and self.fix.get_subscription_count())
+
+    @property
+    def answer(self):
+        """The last row of ~/processed: messages, refused, estimates."""
+        columns = decode_table(self.answers[-1])
+        return tuple(int(columns[name][0]) for name in ('messages', 'refused', 'estimates'))
+
+    def send(self, *messages):
+        """Publish one after another, each when the one before has been answered."""
+        for message in messages:
+            answered = self.answer[0]
+            self.fix.publish(message)
+            self.bench.spin_until(lambda before=answered: self.answer[0] > before)
+        self.bench.spin_until(lambda: len(self.estimates) >= self.answer[2])
+
+    def means(self):
+        return [(e.stamp_ns / SECOND, *e.state[0, :2]) for e in map(read_estimate, self.estimates)]
+
+
+# -- a small recording for what plays and steps, and an ear for what is played --
+
+START = 1_700_000_000 * 10**9
+STEP = 10**7
+COUNT = 20
+
+
+def write_fixes(path):
+    """Twenty fixes 10 ms apart, the fourth not a number, and a second topic with one message."""
+    with BagWriter(path) as writer:
+        for k in range(COUNT):
+            place = {'position': (float(k), 0.0, 0.0), 'covariance': np.eye(2)}
+            fix = Fix(stamp_ns=START + k * STEP, frame_id='map', **place)
+            message = write_fix(fix, ros_message)
+            if k == 3:
+                message.pose.pose.position.x = float('nan')
+            writer.write('/fix', message, fix.stamp_ns)
+        writer.write('/other', ros_message('std_msgs/msg/Float64', data=1.5), START)
+    return path
+
+
+class Ear:
+    """Hears everything on a topic, though it only listens when asked."""
+
+    def __init__(self, link, message_type, topic):
+        self.link, self.received = link, []
+        self.subscription = link.node.create_subscription(
+            message_type, topic, self.received.append, lockstep_qos()
+        )
+
+    def positions(self, count):
+        assert self.link.wait_for(lambda: len(self.received) >= count, 60.0)
+        return [message.pose.pose.position.x for message in self.received]

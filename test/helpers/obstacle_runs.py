@@ -20,6 +20,7 @@ from sonar_imm.trackers.obstacle.filters import build_filter, Sonar
 from sonar_imm.trackers.obstacle.mixtures import innovations
 from sonar_imm.trackers.obstacle.pings import Echoes, Mount
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm_tools.cli import main
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 SECOND = 10**9
@@ -174,3 +175,40 @@ def follow(measurements, config):
                 mixture = filter_.update(mixture, h, z, R, sonar)[0]
         before = sonar
     return np.array(nis), filter_.view(mixture, sonar)
+
+
+def crossing(pings=80, detected=1.0, clutter=0.0, late=10**6):
+    """The estimates ping by ping, and the true velocities (3, 2), east and north. Every echo comes
+    with the probability `detected`, among `clutter` false ones a ping on average; the third
+    obstacle echoes from ping `late` on and does not move."""
+    rng = np.random.default_rng(3)
+    velocity = np.array([[0.0, 0.5], [0.0, -0.5], [0.0, 0.0]])
+    start = np.array([[70.0, -10.0], [72.0, 10.0], [84.0, 12.0]])
+    measurements = []
+    for k in range(pings):
+        t, stamp = 0.5 * k, SECOND + k * SECOND // 2
+        measurements.append(
+            Navigation(stamp_ns=stamp, position=[t, 0.0, -20.0], orientation=[0.0, 0.0, 0.0, 1.0])
+        )
+        off = start + t * velocity - [t, 0.0]
+        z = np.column_stack([np.hypot(*off.T), np.arctan2(off[:, 1], off[:, 0])])
+        z[:2] += rng.normal(size=(2, 2)) * [0.1, 0.003]
+        echoes = [z[0], z[1]]
+        if detected < 1.0 or k >= late:
+            z[2] += rng.normal(size=2) * [0.1, 0.003]
+            echoes = [item for item in z[: 3 if k >= late else 2] if rng.uniform() < detected]
+            echoes += [
+                rng.uniform([5.0, -0.39], [99.0, 0.39]) for _ in range(rng.poisson(clutter))
+            ]
+        seen = np.reshape(echoes, (-1, 2))
+        measurements.append(Detections(stamp_ns=stamp, range=seen[:, 0], bearing=seen[:, 1]))
+    return list(run(ObstacleTracker(ObstacleConfig()), measurements).values()), velocity
+
+
+def tracked_by_command(folder, scenario='tethers', seed=1, **settings):
+    """Simulate and track into `folder`; gives the folder of the run."""
+    changed = [part for name, value in settings.items() for part in ('--set', f'{name}={value}')]
+    scene = ['simulate', 'obstacle', str(folder / 'scene'), '--scenario', scenario]
+    assert main([*scene, '--seed', str(seed), *changed]) == 0
+    assert main(['track', str(folder / 'scene'), str(folder / 'run')]) == 0
+    return folder / 'run'

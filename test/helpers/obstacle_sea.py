@@ -19,12 +19,9 @@ from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'obstacle_sea'
 ENCOUNTERS = (
-    ('swaying_approach', 0),
-    ('moving_target', 0),
-    ('starts_moving', 0),
-    ('seabed_and_fixed', 0),
+    ('swaying_approach', 0), ('moving_target', 0), ('starts_moving', 0), ('seabed_and_fixed', 0),
     ('seabed_and_fixed', 1),
-)
+)  # fmt: skip
 KINDS = ('fixed', 'swaying', 'moving', 'seabed')
 
 
@@ -41,13 +38,10 @@ def measurements(data, altitude=True):
         if altitude:
             yield Altitude(stamp_ns=stamp, altitude=float(data['altitude'][k]))
         yield Navigation(
-            stamp_ns=stamp,
-            position=data['odom_p'][k],
-            orientation=data['odom_q'][k],
-            velocity=data['odom_v'][k].astype(float),
-            turn_rate=data['odom_w'][k].astype(float),
+            stamp_ns=stamp, position=data['odom_p'][k], orientation=data['odom_q'][k],
+            velocity=data['odom_v'][k].astype(float), turn_rate=data['odom_w'][k].astype(float),
             frame_id='odom',
-        )
+        )  # fmt: skip
         seen = np.isfinite(data['meas_range'][k])
         yield Detections(
             stamp_ns=stamp,

@@ -5,17 +5,15 @@
 # writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
-"""A small simulated scene of every system."""
+"""Small simulated scenes of every system."""
 
 import importlib
 
 SMALL = {
-    'bathymetry': ('paper', {'pings': 2}),
-    'diver': ('several', {'duration': 20.0}),
-    'fathometer': ('drift_traces', {'records': 4}),
-    'obstacle': ('approach', {'first_range': 60.0, 'last_range': 50.0}),
-}
-"""Scenario and overrides that make it small, by system."""
+    'bathymetry': 'paper', 'diver': 'several', 'fathometer': 'drift_traces',
+    'obstacle': 'approach',
+}  # fmt: skip
+"""A scenario of each system."""
 
 SMALLER = {
     'bathymetry': {'pings': 2},
@@ -41,7 +39,4 @@ def smaller_scene(system, name, seed):
 
 def small_scene(system, seed):
     """(parameters, scene) of a system."""
-    scenes = importlib.import_module(system.scenes)
-    name, overrides = SMALL[system.name]
-    config = scenes.scenario(name, overrides)
-    return config, scenes.simulate(config, seed)
+    return smaller_scene(system, SMALL[system.name], seed)

@@ -5,11 +5,12 @@
 # writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
-"""Files of XTF, made by the writer of pyxtf."""
+"""Files of XTF, made by the writer of pyxtf, and of SEG-Y, by that of segyio."""
 
 from datetime import datetime, timedelta, timezone
 
 import numpy as np
+import pytest
 
 BEGIN = datetime(2024, 5, 31, 10, 0, 0, tzinfo=timezone.utc)
 PLACE = 54.0, 10.0
@@ -101,4 +102,23 @@ def side_scan(path, pings=60, bins=500, target=(3.0, 30.0), seed=1, spots=None):
         samples = [port[::-1].astype('u2'), starboard.astype('u2')]
         parts.append(xtf_ping(seconds, samples, place))
     path.write_bytes(b''.join(parts))
+    return path
+
+
+def write_segy(path, amplitude, fmt=1, **fields):
+    """Traces (T, n) in the sample format `fmt`; fields: of their headers by the names of segyio,
+    one value for all or (T,)."""
+    segyio = pytest.importorskip('segyio')
+    spec = segyio.spec()
+    spec.format, spec.tracecount = fmt, len(amplitude)
+    spec.samples = np.arange(amplitude.shape[1], dtype=float)
+    fields = {'TRACE_SAMPLE_COUNT': amplitude.shape[1], **fields}
+    columns = {
+        getattr(segyio.TraceField, name): np.broadcast_to(value, len(amplitude)).tolist()
+        for name, value in fields.items()
+    }
+    with segyio.create(str(path), spec) as file:
+        for k, trace in enumerate(amplitude):
+            file.trace[k] = trace.astype(file.dtype)
+            file.header[k] = {field: values[k] for field, values in columns.items()}
     return path

@@ -8,10 +8,7 @@
 
 """The source tree as the tests of the house read it: modules, imports, circles of imports."""
 
-from __future__ import annotations
-
 import ast
-from collections.abc import Iterable, Mapping
 import contextlib
 from functools import cache
 from pathlib import Path
@@ -32,24 +29,24 @@ COME_WITH_RCLPY = {'builtin_interfaces', 'lifecycle_msgs', 'rcl_interfaces', 'ro
 ROS_MODULES = COMMON_INTERFACES | COME_WITH_RCLPY | {'rclpy', 'ament_index_python'}
 
 
-def module_name(path: Path) -> str:
+def module_name(path):
     parts = path.relative_to(ROOT).with_suffix('').parts
     return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
 
 
-def known_module(modules: Iterable[str], name: str) -> str | None:
+def known_module(modules, name):
     """The module of ours that a dotted name is or is defined in."""
     while name and name not in modules:
         name = name.rpartition('.')[0]
     return name or None
 
 
-def circle_of(graph: Mapping[str, set[str]]) -> list[str] | None:
+def circle_of(graph):
     """A way from a module over its imports back to it, or None."""
-    done: set[str] = set()
-    way: list[str] = []
+    done = set()
+    way = []
 
-    def visit(name: str) -> list[str] | None:
+    def visit(name):
         if name in way:
             return [*way[way.index(name) :], name]
         if name in done:
@@ -64,18 +61,18 @@ def circle_of(graph: Mapping[str, set[str]]) -> list[str] | None:
 
 
 @cache
-def tree_of(path: Path) -> ast.Module:
+def tree_of(path):
     """The module as it is parsed, once for all tests of a process."""
     return ast.parse(path.read_text(encoding='utf-8'))
 
 
 @cache
-def imports(path: Path) -> list[str]:
+def imports(path):
     """Every name the module imports, made absolute, at the top or inside a function."""
     return imported_names(tree_of(path), path)
 
 
-def imported_names(tree: ast.Module, path: Path) -> list[str]:
+def imported_names(tree, path):
     """Every name that the module at `path` imports, made absolute."""
     package = module_name(path) if path.name == '__init__.py' else module_name(path.parent)
     names = []
@@ -89,7 +86,7 @@ def imported_names(tree: ast.Module, path: Path) -> list[str]:
     return names
 
 
-def commits() -> int:
+def commits():
     """How many commits there are, which chooses what is run in turn; 0 outside of a checkout."""
     command = ['git', '-C', str(ROOT), 'rev-list', '--count', 'HEAD']
     with contextlib.suppress(OSError):

@@ -14,15 +14,7 @@ import sys
 import numpy as np
 import pytest
 
-from msg_adapters.fixes import (
-    read_fix,
-    read_geodetic,
-    read_relative,
-    read_vessel_fix,
-    write_fix,
-    write_geodetic,
-    write_relative,
-)
+from msg_adapters import fixes
 from msg_adapters.navigation import read_heading, read_vessel_pose, write_heading, write_navigation
 from msg_adapters.scans import read_scan, write_scan
 from sonar_imm.acoustics.geometry import Pose, rotation
@@ -60,12 +52,12 @@ def variances(message, *diagonal):
 
 def pose_of_fix(variance):
     fix = Fix(stamp_ns=S, position=(1.0, 2.0, 0.0), frame_id='map')
-    return read_fix(variances(write_fix(fix, ros_message), *[variance] * 6))
+    return fixes.read_fix(variances(fixes.write_fix(fix, ros_message), *[variance] * 6))
 
 
 def of_satellites(of, read, kind):
     def read_with(variance):
-        message = write_geodetic(of(stamp_ns=S, latitude=59.0, longitude=10.0), ros_message)
+        message = fixes.write_geodetic(of(stamp_ns=S, latitude=59.0, longitude=10.0), ros_message)
         message.position_covariance[:] = np.diag(np.full(3, variance)).ravel()
         message.position_covariance_type = kind
         return read(message)
@@ -75,7 +67,7 @@ def of_satellites(of, read, kind):
 
 def of_transceiver(variance):
     fix = RelativeFix(stamp_ns=S, offset=(30.0, 4.0, -5.0), frame_id='usbl')
-    return read_relative(variances(write_relative(fix, ros_message), *[variance] * 6))
+    return fixes.read_relative(variances(fixes.write_relative(fix, ros_message), *[variance] * 6))
 
 
 def row_of_scan(variance):
@@ -100,9 +92,9 @@ def row_of_scan(variance):
 
 ROADS = {
     'PoseWithCovarianceStamped': pose_of_fix,
-    'NavSatFix diagonal': of_satellites(GeodeticFix, read_geodetic, 2),
-    'NavSatFix known': of_satellites(GeodeticFix, read_geodetic, 3),
-    'NavSatFix of the vessel': of_satellites(VesselFix, read_vessel_fix, 2),
+    'NavSatFix diagonal': of_satellites(GeodeticFix, fixes.read_geodetic, 2),
+    'NavSatFix known': of_satellites(GeodeticFix, fixes.read_geodetic, 3),
+    'NavSatFix of the vessel': of_satellites(VesselFix, fixes.read_vessel_fix, 2),
     'relative': of_transceiver,
     'row of a table': row_of_scan,
 }
@@ -124,8 +116,8 @@ def test_variances_of_x_and_y(read):
 def test_one_axis_that_is_far_from_known_is_used():
     """As a bearing and a range from far away say it."""
     fix = Fix(stamp_ns=S, position=(5e4, 0.0, 0.0), frame_id='map')
-    message = variances(write_fix(fix, ros_message), 4.0, 3e6, 0.0, 0.0, 0.0, 0.0)
-    assert read_fix(message).covariance[1, 1] == 3e6
+    message = variances(fixes.write_fix(fix, ros_message), 4.0, 3e6, 0.0, 0.0, 0.0, 0.0)
+    assert fixes.read_fix(message).covariance[1, 1] == 3e6
 
 
 def odometry(second, *diagonal):

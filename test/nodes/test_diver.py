@@ -12,7 +12,7 @@ import math
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped as POSE
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix, Fixes, GeodeticFix, RelativeFix, Start, VesselPose
 from sonar_imm.nodes.diagnostics import clock_offset
 from sonar_imm.nodes.diver import DiverNode
-from sonar_imm.nodes.messages import make, message_class
+from sonar_imm.nodes.messages import make
 from sonar_imm.nodes.qos import lockstep_qos, output_qos
 from sonar_imm.parameters import ConfigError
 
@@ -127,6 +127,8 @@ def test_what_waited_in_the_node_is_dropped_and_what_is_late_is_not(rig, waited,
     """Behind a busy tracker, from a slow sensor, and from a clock that is off."""
     bench, node, *_ = rig
     received = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    bench.spin_until(lambda: received)
+    received.clear()
     for k in range(12):
         now_ns = time.time_ns()
         stamp_ns = now_ns - round((waited + behind) * 1e9) + k
@@ -136,8 +138,7 @@ def test_what_waited_in_the_node_is_dropped_and_what_is_late_is_not(rig, waited,
     assert node._meter.dropped == ({} if used else {'fix': 12})
     assert node.tracker.counts['used'] == (12 if used else 0)
     bench.spin_until(lambda: len(received) > 3)
-    input_part, tracker = received[-1].status
-    said = f'{input_part.message}; {tracker.message}'
+    said = '; '.join(status.message for each in received for status in each.status)
     assert ('12 messages dropped' in said) == (not used)
     assert ('arrive that late' in said) == (behind == 20)
     assert ('the clock of this computer' in said) == (abs(behind) == 3600)
@@ -145,21 +146,11 @@ def test_what_waited_in_the_node_is_dropped_and_what_is_late_is_not(rig, waited,
 
 def test_a_diver_is_tracked_from_fixes(rig):
     bench, node, odometry, probabilities = rig
-    publisher = bench.peer.create_publisher(
-        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', 10
-    )
-    bench.spin_until(publisher.get_subscription_count)
+    publisher = bench.publisher(POSE, '/fix', 10)
     for second in range(1, 31):
-        publisher.publish(
-            write_fix(
-                Fix(
-                    stamp_ns=second * 10**9, position=(1.0 * second, 0.0, 0.0),
-                    covariance=0.01 * np.eye(2), frame_id='map',
-                ),
-                make,
-            )
-        )  # fmt: skip
-        bench.spin_until(lambda want=second: node._meter.received['fix'] == want)
+        place = {'position': (1.0 * second, 0.0, 0.0), 'covariance': 0.01 * np.eye(2)}
+        fix = Fix(stamp_ns=second * 10**9, frame_id='map', **place)
+        bench.send(node, publisher, write_fix(fix, make))
     bench.spin_until(lambda: odometry and odometry[-1].header.stamp.sec == 30)
     assert odometry[-1].pose.pose.position.x == pytest.approx(30.0, abs=0.5)
     assert odometry[-1].twist.twist.linear.x == pytest.approx(1.0, abs=0.2)
@@ -171,10 +162,8 @@ def test_scans_are_heard_and_an_empty_one_is_a_missed_detection(make_bench):
     bench = make_bench()
     node = bench.add(DiverNode(context=bench.context))
     estimates = bench.listen(PointCloud2, '/diver/estimate')
-    publisher = bench.peer.create_publisher(PointCloud2, '/fixes', lockstep_qos())
-    bench.spin_until(
-        lambda: publisher.get_subscription_count() and node._estimates.get_subscription_count()
-    )
+    publisher = bench.publisher(PointCloud2, '/fixes')
+    bench.spin_until(node._estimates.get_subscription_count)
     for second in range(1, 8):
         places = [[0.5 * second, 0.0, 0.0]] if second < 7 else np.empty((0, 3))
         scan = Fixes(
@@ -201,12 +190,6 @@ def start(make_bench, *parameters):
     return bench, node
 
 
-def publisher(bench, type_name, topic):
-    made = bench.peer.create_publisher(message_class(type_name), topic, lockstep_qos())
-    bench.spin_until(made.get_subscription_count)
-    return made
-
-
 def on_earth(k, x, status=0, topic_frame='gps'):
     latitude, longitude, _ = ORIGIN.geodetic(np.array([x, 5.0, 0.0]))
     message = write_geodetic(
@@ -220,18 +203,12 @@ def on_earth(k, x, status=0, topic_frame='gps'):
     return message
 
 
-def received(node):
-    return node._meter.received.total()
-
-
 def test_navsatfix_in_and_out(make_bench):
     bench, node = start(make_bench, "input_types:=['fix=sensor_msgs/msg/NavSatFix']")
     geo = bench.listen(NavSatFix, '/diver/geo')
     bench.spin_until(lambda: node.count_subscribers('/diver/geo'))
-    fixes = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/fix')
-    for k in range(1, 21):
-        fixes.publish(on_earth(k, 0.5 * k))
-        bench.spin_until(lambda want=k: received(node) == want)
+    fixes = bench.publisher(NavSatFix, '/fix')
+    bench.send(node, fixes, *(on_earth(k, 0.5 * k) for k in range(1, 21)))
     bench.spin_until(lambda: geo and geo[-1].header.stamp.sec == 20)
     assert geo[-1].header.frame_id == 'diver_1'
     back = read_geodetic(geo[-1])
@@ -240,38 +217,26 @@ def test_navsatfix_in_and_out(make_bench):
 
 
 @pytest.mark.usefixtures('quick')
-def test_what_has_no_fix_and_what_is_repeated_is_in_diagnostics(make_bench):
+def test_what_has_no_fix_and_what_is_repeated_is_counted_and_said(make_bench):
     bench, node = start(make_bench, "input_types:=['fix=sensor_msgs/msg/NavSatFix']")
     arrived = bench.listen(DiagnosticArray, '/diagnostics')
-    fixes = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/fix')
-    for k, x, status in ((1, 0.0, 0), (2, 0.0, 0), (3, 0.5, -1), (4, 0.6, 0)):
-        fixes.publish(on_earth(k, x, status))
-    bench.spin_until(lambda: received(node) == 4)
-    assert dict(node._meter.refused) == {'repeated': 1, 'no_fix': 1}
+    fixes = bench.publisher(NavSatFix, '/fix')
+    given = ((1, 0.0, 0), (2, 0.0, 0), (3, 0.5, -1), (4, 0.6, 0))
+    bench.send(node, fixes, *(on_earth(*each) for each in given))
+    assert node._meter.refused == {'repeated': 1, 'no_fix': 1} and node._published == 2
     count = len(arrived)
     bench.spin_until(lambda: len(arrived) > count + 1)
     values = {item.key: item.value for status in arrived[-1].status for item in status.values}
     assert values['refused: repeated'] == '1' and values['refused: no_fix'] == '1'
-
-
-def test_after_a_reset_nothing_is_a_repetition(make_bench):
-    bench, node = start(make_bench, "input_types:=['fix=sensor_msgs/msg/NavSatFix']")
-    fixes = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/fix')
-    for k in (1, 2):
-        fixes.publish(on_earth(k, 0.0))
-        bench.spin_until(lambda want=k: received(node) == want)
-    assert node._meter.refused == {'repeated': 1}
     bench.call(Trigger, '/diver/reset', Trigger.Request())
-    fixes.publish(on_earth(3, 0.0))
-    bench.spin_until(lambda: received(node) == 3)
-    assert node._meter.refused == {'repeated': 1} and node._published == 2
+    bench.send(node, fixes, on_earth(5, 0.6))  # after a reset nothing is a repetition
+    assert node._meter.refused['repeated'] == 1 and node._published == 3
 
 
 def test_relative_fixes_are_composed_with_nav(make_bench):
     bench, node = start(make_bench)
     tables = bench.listen(PointCloud2, '/diver/estimate', lockstep_qos())
-    relative = publisher(bench, 'geometry_msgs/msg/PoseWithCovarianceStamped', '/relative')
-    nav = publisher(bench, 'nav_msgs/msg/Odometry', '/nav')
+    relative, nav = bench.publisher(POSE, '/relative'), bench.publisher(Odometry, '/nav')
     for k in range(1, 12):
         pose = VesselPose(
             stamp_ns=round((k - 0.5) * SECOND),
@@ -279,11 +244,9 @@ def test_relative_fixes_are_composed_with_nav(make_bench):
             orientation=(0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)),
             frame_id='odom',
         )
-        nav.publish(write_navigation(pose, make))
-        bench.spin_until(lambda want=2 * k - 1: received(node) == want)
+        bench.send(node, nav, write_navigation(pose, make))
         fix = RelativeFix(stamp_ns=k * SECOND, offset=(20.0, k + 0.5, -5.0), frame_id='usbl')
-        relative.publish(write_relative(fix, make))
-        bench.spin_until(lambda want=2 * k: received(node) == want)
+        bench.send(node, relative, write_relative(fix, make))
     bench.spin_until(lambda: len(tables) == node._published)
     last = read_estimate(tables[-1])
     assert last.frame_id == 'odom' and last.stamp_ns == 10 * SECOND
@@ -296,13 +259,10 @@ def test_a_tag_has_a_topic_of_its_own(make_bench):
         make_bench, "input_types:=['fix=sensor_msgs/msg/NavSatFix']", "tags:=['amy','bob']"
     )
     tables = bench.listen(PointCloud2, '/diver/estimate', lockstep_qos())
-    amy = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/amy/fix')
-    bob = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/bob/fix')
+    amy, bob = (bench.publisher(NavSatFix, f'/{name}/fix') for name in ('amy', 'bob'))
     for k in range(1, 8):
-        amy.publish(on_earth(k, 0.3 * k))
-        bench.spin_until(lambda want=2 * k - 1: received(node) == want)
-        bob.publish(on_earth(k, 1.0 + 0.2 * k))
-        bench.spin_until(lambda want=2 * k: received(node) == want)
+        bench.send(node, amy, on_earth(k, 0.3 * k))
+        bench.send(node, bob, on_earth(k, 1.0 + 0.2 * k))
     bench.spin_until(lambda: len(tables) == node._published)
     assert sorted(read_estimate(tables[-1]).extras['target_id'].tolist()) == [1, 2]
 
@@ -313,9 +273,6 @@ def test_a_type_that_is_not_installed_is_one_sentence(make_bench):
 
 
 # -- ``~/initial`` of the diver node: a track begins where somebody says that a diver is --
-
-
-POSE = PoseWithCovarianceStamped
 
 
 def told(second, x, frame_id='map'):
@@ -332,35 +289,22 @@ def test_a_start_begins_a_track_and_a_useless_one_is_refused_by_name(make_bench,
     bench = make_bench()
     node = bench.add(DiverNode(context=bench.context))
     estimates = bench.listen(PointCloud2, '/diver/estimate')
-    initial = bench.peer.create_publisher(POSE, '/diver/initial', 10)
-    fixes = bench.peer.create_publisher(POSE, '/fix', 10)
-    bench.spin_until(
-        lambda: (
-            initial.get_subscription_count()
-            and fixes.get_subscription_count()
-            and node.count_subscribers('/diver/estimate')
-        )
-    )
-
-    def send(publisher, message):
-        before = node._meter.received.total()
-        publisher.publish(message)
-        bench.spin_until(lambda: node._meter.received.total() > before)
-
-    send(initial, told(1, 5.0))
+    initial = bench.publisher(POSE, '/diver/initial', 10)
+    fixes = bench.publisher(POSE, '/fix', 10)
+    bench.spin_until(lambda: node.count_subscribers('/diver/estimate'))
+    bench.send(node, initial, told(1, 5.0))
     bench.spin_until(lambda: estimates)
     first = read_estimate(estimates[0])
     assert first.extras['track_state'].tolist() == [1] and first.xyz[0].tolist() == [5.0, 2.0, 0.0]
     fix = Fix(stamp_ns=2 * SECOND, position=[5.5, 2.0, 0.0], frame_id='map')
-    send(fixes, write_fix(fix, make))
+    bench.send(node, fixes, write_fix(fix, make))
     bench.spin_until(lambda: len(estimates) == 2)
     assert read_estimate(estimates[1]).extras['track_id'].tolist() == [1]
 
     nan, unknown = told(3, math.pi), told(3, 4.0)
     nan.pose.pose.position.x = math.nan
     unknown.pose.covariance = np.zeros(36)
-    for bad in (nan, unknown, told(3, 4.0, frame_id='odom')):
-        send(initial, bad)
+    bench.send(node, initial, nan, unknown, told(3, 4.0, frame_id='odom'))
     assert node._meter.refused == {'nan': 1, 'no_covariance': 1, 'frame': 1}
     assert node._meter.received == {'initial': 4, 'fix': 1} and len(estimates) == 2
     errors = capfd.readouterr().err

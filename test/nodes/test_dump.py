@@ -137,12 +137,9 @@ FOLDER = Path(__file__).resolve().parents[2] / 'config' / 'sros2'
 # So that the node starts where messages of others are not installed.
 EXTRA = {'fls_detector': ['-p', "input_types:=['image=sensor_msgs/msg/Image']"]}
 PROGRAMS = {
-    'bathymetry': BathymetryNode,
-    'diver': DiverNode,
-    'fathometer': FathometerNode,
-    'fls_detector': FlsDetectorNode,
-    'obstacle': ObstacleNode,
-}
+    'bathymetry': BathymetryNode, 'diver': DiverNode, 'fathometer': FathometerNode,
+    'fls_detector': FlsDetectorNode, 'obstacle': ObstacleNode,
+}  # fmt: skip
 
 
 def allowed(name, node):

@@ -51,17 +51,11 @@ def picture(second=100, spoilt=False, frame_id='sonar'):
 
 def projected():
     bearing = np.radians(np.linspace(20.0, -20.0, 9))
+    directions = np.column_stack([np.cos(bearing), np.sin(bearing), np.zeros(9)])
     return marine.make(
-        'ProjectedSonarImage',
-        header=marine.header(),
-        ping_info=marine.ping_info(),
-        beam_directions=marine.vectors(
-            np.column_stack([np.cos(bearing), np.sin(bearing), np.zeros(9)])
-        ),
-        ranges=marine.floats(np.arange(1.0, 51.0)),
-        image=marine.make(
-            'SonarImageData', is_bigendian=False, dtype=0, beam_count=9, data=pixels().ravel(),
-        ),
+        'ProjectedSonarImage', header=marine.header(), ping_info=marine.ping_info(),
+        beam_directions=marine.vectors(directions), ranges=marine.floats(np.arange(1.0, 51.0)),
+        image=marine.image_data(pixels(), 0, 9),
     )  # fmt: skip
 
 
@@ -166,15 +160,7 @@ def test_a_mistake_in_the_detector_ends_neither_node_nor_answers(make_bench, mon
     assert counts(answers[-1])['estimates'] == 1
 
 
-@pytest.mark.parametrize(
-    'argument, word',
-    [
-        ('image_order:=sideways', 'image_order'),
-        ("input_types:=['image=sensor_msgs/msg/LaserScan']", 'input_types: image must be one of'),
-        ('sidelobe_db:=-1.0', 'sidelobe_db'),
-    ],
-)
-def test_a_wrong_parameter_is_named(make_bench, argument, word):
-    bench = make_bench('-p', argument)
-    with pytest.raises(ConfigError, match=word):
+def test_a_wrong_parameter_is_named(make_bench):
+    bench = make_bench('-p', "input_types:=['image=sensor_msgs/msg/LaserScan']")
+    with pytest.raises(ConfigError, match='input_types: image must be one of'):
         bench.add(FlsDetectorNode(context=bench.context))

@@ -35,12 +35,9 @@ BAGS = {
     'diver': 'diver_multistatic',
 }
 IN_3D = {
-    'geometry_msgs/msg/PoseArray',
-    'geometry_msgs/msg/PoseWithCovarianceStamped',
-    'nav_msgs/msg/Odometry',
-    'sensor_msgs/msg/PointCloud2',
-    'visualization_msgs/msg/MarkerArray',
-}
+    'geometry_msgs/msg/PoseArray', 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'nav_msgs/msg/Odometry', 'sensor_msgs/msg/PointCloud2', 'visualization_msgs/msg/MarkerArray',
+}  # fmt: skip
 RVIZ = {
     'MarkerArray': 'visualization_msgs/msg/MarkerArray',
     'Odometry': 'nav_msgs/msg/Odometry',

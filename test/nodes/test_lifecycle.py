@@ -12,8 +12,7 @@ import math
 import sys
 
 from diagnostic_msgs.msg import DiagnosticArray
-from helpers.node_bench import Held
-from helpers.rig import a_fix, FIX
+from helpers.node_bench import a_fix, FIX, Held
 from helpers.walker import WalkerTracker
 from lifecycle_msgs.msg import State, Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState

@@ -13,11 +13,14 @@ import time
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from helpers.node_bench import a_fix
 import numpy as np
 import pytest
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.node import Node
 from std_msgs.msg import Float64
 
+from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.qos import Endpoints, input_qos, output_qos, SequenceGaps
 
 
@@ -108,13 +111,8 @@ def test_the_real_middleware_numbers_messages_and_the_queue_is_counted(make_benc
     received = []
     endpoints = Endpoints(bench.peer)
     endpoints.subscribe(Float64, 'depth', lambda m, _: received.append(m.data), input_qos(10))
-    writer = bench.add(
-        type(bench.peer)('writer', context=bench.context, use_global_arguments=False)
-    )
-    qos = QoSProfile(
-        reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=1000
-    )
-    publishers = [writer.create_publisher(Float64, 'depth', qos) for _ in range(2)]
+    writer = bench.add(Node('writer', context=bench.context, use_global_arguments=False))
+    publishers = [writer.create_publisher(Float64, 'depth', 1000) for _ in range(2)]
     bench.spin_until(lambda: all(item.get_subscription_count() for item in publishers))
     sent = itertools.count()
     for publisher in publishers:
@@ -143,23 +141,16 @@ def test_a_middleware_without_numbers_is_believed_what_it_says_was_lost(make_ben
 
 @pytest.mark.usefixtures('quick')
 def test_a_node_warns_of_the_share_that_it_lost(make_bench, walker):
-    from sonar_imm.nodes.base import TrackerNode
-    from sonar_imm.nodes.messages import message_class
-
     bench = make_bench('-p', 'qos_overrides./fix.subscription.depth:=5')
     node = bench.add(TrackerNode('walker', context=bench.context))
     given = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
-    kind = message_class('geometry_msgs/msg/PoseWithCovarianceStamped')
-    fix = bench.peer.create_publisher(kind, 'fix', 100)
-    bench.spin_until(fix.get_subscription_count)
-    message = kind()
-    message.header.stamp.sec = 1
-    fix.publish(message)
-    bench.spin_until(lambda: node._meter.received['fix'] == 1)
+    fix, message = bench.publisher(PoseWithCovarianceStamped, 'fix', 100), a_fix(1.0)
+    bench.send(node, fix, message)
     for _ in range(100):
         fix.publish(message)
     bench.spin_until(lambda: any('are lost before' in item.status[0].message for item in given))
-    printed = next(item.status[0] for item in given if 'are lost before' in item.status[0].message)
+    statuses = [item.status[0] for item in given]
+    printed = next(status for status in statuses if 'are lost before' in status.message)
     assert printed.level == DiagnosticStatus.WARN
     assert '% on fix' in printed.message
 

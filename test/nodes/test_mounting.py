@@ -21,7 +21,7 @@ from sonar_imm.nodes.bathymetry import BathymetryNode
 from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.obstacle import ObstacleNode
-from sonar_imm.nodes.qos import lockstep_qos, transforms_qos
+from sonar_imm.nodes.qos import transforms_qos
 from sonar_imm.trackers.diver.known import track_positions
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.simulation.bathymetry import simulator as swath
@@ -52,18 +52,14 @@ class Life:
     """One life of a node that keeps its state, and what is sent to it."""
 
     def __init__(self, make_bench, node_type, state, *more):
-        words = [f'state_file:={state}', f"input_types:=['tf_static={ALONE}']", *more]
+        words = [f'state_file:={state}', f"input_types:=['tf_static={ALONE}']", 'max_wait:=0.0']
+        words += more
         self.bench = make_bench(*[word for item in words for word in ('-p', item)])
         self.node = self.bench.add(node_type(context=self.bench.context))
-        self.sent = 0
 
     def send(self, topic, message, type_name, qos=None):
-        kind = message_class(type_name)
-        publisher = self.bench.peer.create_publisher(kind, topic, qos or lockstep_qos())
-        self.bench.spin_until(publisher.get_subscription_count)
-        publisher.publish(message)
-        self.sent += 1
-        self.bench.spin_until(lambda: self.node._meter.received.total() == self.sent)
+        publisher = self.bench.publisher(type_name, topic, qos)
+        self.bench.send(self.node, publisher, message)
 
     def tell(self, *where):
         self.send('/tf_static', transform(*where), ALONE, transforms_qos())
@@ -147,25 +143,19 @@ def test_a_fix_in_a_frame_that_the_tree_knows_is_turned_and_another_is_refused(m
     node = bench.add(DiverNode(context=bench.context))
     kind = next(entry for entry in inputs_of('diver') if entry.name == 'fix')
     type_name = next(iter(kind.readers))
-    fixes = bench.peer.create_publisher(message_class(type_name), '/fix', lockstep_qos())
-    publisher = bench.peer.create_publisher(message_class(ALONE), '/tf_static', transforms_qos())
-    bench.spin_until(lambda: fixes.get_subscription_count() and publisher.get_subscription_count())
-
-    def send(publisher, message):
-        before = node._meter.received.total()
-        publisher.publish(message)
-        bench.spin_until(lambda: node._meter.received.total() > before)
+    fixes = bench.publisher(type_name, '/fix')
+    publisher = bench.publisher(ALONE, '/tf_static', transforms_qos())
 
     def fix(second, frame_id):
         place = Fix(stamp_ns=second * 10**9, position=(1.0, 2.0, 0.0), frame_id=frame_id)
         return kind.write(evolve(place, covariance=np.eye(2)), make)
 
-    send(fixes, fix(1, 'buoy'))
+    bench.send(node, fixes, fix(1, 'buoy'))
     assert node._meter.refused['frame'] == 1
     assert "'buoy' is not the frame 'map' of the tracks, and no fixed" in capfd.readouterr().err
-    send(publisher, transform('buoy', 'map', (100.0, 0.0, 0.0), (0.0, 0.0, 90.0)))
-    send(fixes, fix(2, 'buoy'))
+    bench.send(node, publisher, transform('buoy', 'map', (100.0, 0.0, 0.0), (0.0, 0.0, 90.0)))
+    bench.send(node, fixes, fix(2, 'buoy'))
     assert node._meter.refused['frame'] == 1
-    send(fixes, fix(4, 'odom'))
+    bench.send(node, fixes, fix(4, 'odom'))
     assert node._meter.refused['frame'] == 2
     assert node.tracker.counts['used'] == 1

@@ -6,20 +6,25 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The executor of the nodes: what it leaves for later still comes."""
+"""The executor of the nodes: what it leaves for later still comes; how the process of a node ends;
+robots in domains of their own."""
 
 import os
 import subprocess
 import sys
 import time
 
+from helpers.node_bench import a_fix, FIX
 import pytest
 import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty
 
+from sonar_imm.nodes.base import TrackerNode
+from sonar_imm.nodes.messages import message_class
 from sonar_imm.nodes.qos import Endpoints, lockstep_qos, output_qos
 from sonar_imm.nodes.running import EVENT_PERIOD, MessagesFirst
+from sonar_imm_tools.replay.harness import reserved_domain_id
 from sonar_imm_tools.replay.link import Link
 
 
@@ -28,27 +33,20 @@ def test_messages_come_at_once_and_events_within_their_period(make_bench):
     node = rclpy.node.Node('hearer', context=bench.context, use_global_arguments=False)
     bench.nodes.append(node)
     endpoints, received, ticks = Endpoints(node), [], []
-    endpoints.subscribe(
-        Empty, 'good', lambda message, info: received.append(message), output_qos()
-    )
-    endpoints.subscribe(
-        Empty, 'bad', lambda message, info: received.append(message), lockstep_qos()
-    )
+    for name, qos in (('good', output_qos()), ('bad', lockstep_qos())):
+        endpoints.subscribe(Empty, name, lambda message, info: received.append(message), qos)
     node.create_timer(0.05, lambda: ticks.append(time.monotonic()))
     best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     bench.peer.create_publisher(Empty, 'bad', best_effort)
     good = bench.peer.create_publisher(Empty, 'good', lockstep_qos())
-    executor = MessagesFirst(context=bench.context)
-    executor.add_node(node)
-    try:
-        end = time.monotonic() + 120.0
+    with MessagesFirst(context=bench.context) as executor:
+        executor.add_node(node)
+        end = time.monotonic() + 240.0
         while not (received and endpoints.incompatible and len(ticks) > 3):
             assert time.monotonic() < end, (received, endpoints.incompatible, ticks)
             good.publish(Empty())
             executor.spin_once(timeout_sec=0.02)
         assert endpoints.incompatible == {'bad': 'RELIABILITY'}
-    finally:
-        executor.shutdown()
 
 
 def test_events_are_asked_a_few_times_a_second_only(make_bench, monkeypatch):
@@ -56,17 +54,13 @@ def test_events_are_asked_a_few_times_a_second_only(make_bench, monkeypatch):
     node = rclpy.node.Node('hearer', context=bench.context, use_global_arguments=False)
     bench.nodes.append(node)
     Endpoints(node).subscribe(Empty, 'good', lambda message: None, output_qos())
-    executor = MessagesFirst(context=bench.context)
-    executor.add_node(node)
-    looks = []
-    monkeypatch.setattr(executor, '_look_at_events', lambda: looks.append(time.monotonic()))
-    try:
-        begin = time.monotonic()
-        while time.monotonic() < begin + 3 * EVENT_PERIOD:
+    with MessagesFirst(context=bench.context) as executor:
+        executor.add_node(node)
+        looks, begin = [], time.monotonic()
+        monkeypatch.setattr(executor, '_look_at_events', lambda: looks.append(time.monotonic()))
+        while time.monotonic() < begin + 3 * EVENT_PERIOD or len(looks) < 2:
             executor.spin_once(timeout_sec=0.01)
-    finally:
-        executor.shutdown()
-    assert 2 <= len(looks) <= 4
+    assert len(looks) <= 1 + (time.monotonic() - begin) / EVENT_PERIOD
     asked = [waitable for waitable in node.waitables if executor.can_execute(waitable)]
     assert len(list(node.waitables)) >= 3 and not asked
 
@@ -123,3 +117,39 @@ def test_a_link_without_a_folder_for_its_log_says_the_same(monkeypatch):
     words = f'from {Link.__module__} import Link; Link("peer")'
     done = subprocess.run([sys.executable, '-c', words], capture_output=True, text=True)
     assert 'LinkError: ROS cannot keep its log' in done.stderr
+
+
+@pytest.mark.usefixtures('walker')
+def test_robots_in_domains_of_their_own_do_not_hear_each_other(monkeypatch):
+    """With the same names on one machine: only the domain is another one."""
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    no_signals = rclpy.signals.SignalHandlerOptions.NO
+    with reserved_domain_id() as item, reserved_domain_id() as another:
+        assert item != another
+        contexts = [rclpy.Context(), rclpy.Context()]
+        for context, domain in zip(contexts, (item, another)):
+            rclpy.init(context=context, domain_id=domain, signal_handler_options=no_signals)
+        executors = [rclpy.executors.SingleThreadedExecutor(context=each) for each in contexts]
+        trackers = [TrackerNode('walker', context=each) for each in contexts]
+        peers = [rclpy.node.Node('peer', context=each) for each in contexts]
+        fixes = [each.create_publisher(message_class(FIX), '/fix', output_qos()) for each in peers]
+        for executor, *nodes in zip(executors, trackers, peers):
+            for node in nodes:
+                executor.add_node(node)
+        try:
+            end, counts = time.monotonic() + 240.0, []
+            while trackers[0]._meter.received['fix'] < 5 and time.monotonic() < end:
+                for executor in executors:
+                    executor.spin_once(timeout_sec=0.02)
+                counts = [each.get_subscription_count() for each in fixes]
+                if counts == [1, 1]:
+                    fixes[0].publish(a_fix(time.monotonic()))
+            assert counts == [1, 1]  # and not two each
+            assert trackers[0]._meter.received['fix'] >= 5
+            assert not trackers[1]._meter.received
+            assert [each.count_publishers('/fix') for each in trackers] == [1, 1]
+        finally:
+            for node in (*trackers, *peers):
+                node.destroy_node()
+            for context in contexts:
+                rclpy.try_shutdown(context=context)

@@ -12,7 +12,7 @@ import re
 import time
 
 from helpers.hostile.states import forge, parts_of
-from helpers.rig import a_fix, Rig
+from helpers.node_bench import a_fix, Rig
 import pytest
 from std_srvs.srv import Trigger
 

@@ -16,9 +16,9 @@ import subprocess
 import sys
 import time
 
+from helpers.clusters import dying as work
 from helpers.dive_bags import write_dive
 from helpers.dive_scenes import estimate_at, legs, SECOND, START_NS
-from helpers.dying import work
 from helpers.source import ROOT
 import numpy as np
 import pytest

@@ -15,12 +15,10 @@ import math
 
 import numpy as np
 
-from sonar_imm.estimation.arrays import ComplexArray, FloatArray
 from sonar_imm.trackers.bathymetry import filter_kernels as k
-from sonar_imm.trackers.bathymetry.bins import Geometry, PingLikelihood
 
 
-def exponentials(values: FloatArray) -> FloatArray:
+def exponentials(values):
     """exp of values (...) that are not positive; 0 below -700 and for NaN."""
     possible = values > k.LEAST_EXPONENT
     v = np.where(possible, values, k.LEAST_EXPONENT)
@@ -33,7 +31,7 @@ def exponentials(values: FloatArray) -> FloatArray:
     return np.where(possible, np.ldexp(p, whole.astype(int)), 0.0)
 
 
-def phasors(values: FloatArray, factor: float) -> tuple[FloatArray, FloatArray]:
+def phasors(values, factor):
     """cos and sin of 2 pi factor values (n,); NaN stays NaN."""
     turns = factor * values
     f = turns - ((turns + k.ROUND) - k.ROUND)
@@ -45,7 +43,7 @@ def phasors(values: FloatArray, factor: float) -> tuple[FloatArray, FloatArray]:
     return c * c - s * s, 2.0 * s * c
 
 
-def polynomial(g: ComplexArray, cosine: FloatArray, sine: FloatArray) -> FloatArray:
+def polynomial(g, cosine, sine):
     """Re sum_k g_k z^k of z = cosine - i sine, (n,)."""
     real, imaginary = np.full_like(cosine, g[-1].real), np.full_like(cosine, g[-1].imag)
     for each in g[-2::-1]:
@@ -55,7 +53,7 @@ def polynomial(g: ComplexArray, cosine: FloatArray, sine: FloatArray) -> FloatAr
     return real
 
 
-def log_densities(q: FloatArray, table: FloatArray) -> FloatArray:
+def log_densities(q, table):
     """The tabulated log likelihood of q (n,)."""
     q = np.minimum(np.where(q > k.LOWEST, q, k.LOWEST), k.HIGHEST)
     bits = q.view(np.int64)
@@ -64,15 +62,7 @@ def log_densities(q: FloatArray, table: FloatArray) -> FloatArray:
     return np.asarray(constant + x * (linear + x * (square + x * cube)))
 
 
-def log_likelihoods(
-    sines: FloatArray,
-    spacing: float,
-    form: ComplexArray,
-    base: float,
-    spread: ComplexArray,
-    signal: float,
-    table: FloatArray,
-) -> FloatArray:
+def log_likelihoods(sines, spacing, form, base, spread, signal, table):
     """Log likelihood of direction sines (n,) for one bin, see `bins.PingLikelihood`; -inf for NaN.
     What does not depend on the direction is left out."""
     cosine, sine = phasors(sines, spacing)
@@ -83,7 +73,7 @@ def log_likelihoods(
     return np.where(np.isnan(sines), -np.inf, log_densities(q, table) - less)
 
 
-def sines_of(state: FloatArray, t: int, g: Geometry) -> FloatArray:
+def sines_of(state, t, g):
     """Direction sines of states (n,) at bin t, NaN where no echo can come from."""
     if not g.of_heights:
         return np.where(np.abs(state) <= k.HALF_CIRCLE, phasors(state, k.TURNS)[1], np.nan)
@@ -100,13 +90,13 @@ def sines_of(state: FloatArray, t: int, g: Geometry) -> FloatArray:
         return np.asarray(ratio * g.cos_tilt[t] - np.sqrt(1.0 - ratio * ratio) * g.sin_tilt[t])
 
 
-def state_log_likelihoods(state: FloatArray, ping: PingLikelihood, t: int) -> FloatArray:
+def state_log_likelihoods(state, ping, t):
     """Log likelihood of states (n,) given bin t."""
     parts = (ping.form[t], ping.base[t], ping.spread[t], ping.signal[t], ping.table)
     return log_likelihoods(sines_of(state, t, ping.geometry), ping.geometry.spacing, *parts)
 
 
-def drift(state: FloatArray, t: int, g: Geometry) -> FloatArray:
+def drift(state, t, g):
     """Where angles (n,) of bin t - 1 are at bin t if the floor keeps its height."""
     out, rise = np.empty_like(state), g.height[t] - g.height[t - 1]
     for s, down in enumerate(state + g.tilt[t - 1]):

@@ -30,9 +30,7 @@ class WeightUpdate(NamedTuple):
     ok: bool
 
 
-def resample(
-    x: FloatArray, w: FloatArray, mu: FloatArray, transition: FloatArray, uniform: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def resample(x, w, mu, transition, uniform):
     """Equally weighted x (M, n, N) for each model, and its predicted probability
     c (M,).
 
@@ -57,7 +55,7 @@ def resample(
     return mixed, c
 
 
-def propagate(x: FloatArray, F: FloatArray, G: FloatArray, noise: FloatArray) -> FloatArray:
+def propagate(x, F, G, noise):
     """x <- F x + G e for each model; noise e (M, k, N) standard normal."""
     M, n, _ = x.shape
     moved = np.zeros_like(x)
@@ -70,7 +68,7 @@ def propagate(x: FloatArray, F: FloatArray, G: FloatArray, noise: FloatArray) ->
     return moved
 
 
-def weigh(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = None) -> WeightUpdate:
+def weigh(log_likelihood, c, w=None):
     """w_n <- w_n q_n / L_j, mu_j <- c_j L_j / sum, L_j = sum_n w_n q_n.
 
     w (M, N): weights before, equal when not given. A model whose particles are all impossible, or
@@ -92,7 +90,7 @@ def weigh(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = None
     return WeightUpdate(weight, joint / total, best + math.log(total), True)
 
 
-def summarise(x: FloatArray, w: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
+def summarise(x, w, mu):
     """Mean (n,) and covariance (n, n) of the mixture of all models."""
     M, n, _ = x.shape
     mean, covariance = np.zeros(n), np.zeros((n, n))
@@ -108,7 +106,7 @@ def summarise(x: FloatArray, w: FloatArray, mu: FloatArray) -> tuple[FloatArray,
     return mean, covariance
 
 
-def effective_sample_size(w: FloatArray, mu: FloatArray) -> float:
+def effective_sample_size(w, mu):
     """sum_j mu_j / sum_n w_jn^2: how many particles of the likely models count."""
     return _total(np.array([m / _total(np.square(row)) for m, row in zip(mu, w)]))
 
@@ -143,6 +141,6 @@ def filter_bins(x, w, mu, models, chains, uniform, noise, echo, look, drift):
     return answers, x, w
 
 
-def _total(values: FloatArray) -> float:
+def _total(values):
     """The sum from left to right, as a loop makes it: numpy's own sum pairs its terms."""
     return float(np.cumsum(values)[-1])

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sonar_imm.estimation.arrays import BoolArray, FloatArray
+from sonar_imm.estimation.arrays import FloatArray
 
 
 class Moments(NamedTuple):
@@ -31,21 +31,13 @@ class Moments(NamedTuple):
     log_likelihood: FloatArray
 
 
-def density(x: FloatArray, std: float) -> FloatArray:
+def density(x, std):
     """Normal density of x (...), as a share of the cells of the last axis."""
     shape = np.exp(-0.5 * np.square(x / std))
     return np.asarray(shape / np.maximum(shape.sum(axis=-1, keepdims=True), 1e-300))
 
 
-def motion(
-    base: FloatArray,
-    slope: FloatArray,
-    walk: float,
-    phi: float,
-    follow: bool,
-    slope0: float,
-    width: float,
-) -> tuple[FloatArray, FloatArray]:
+def motion(base, slope, walk, phi, follow, slope0, width):
     """How one model moves: weights (S, S') of slopes, and (S, S', B, B') of heights given both."""
     S = len(slope)
     if not follow:
@@ -60,18 +52,8 @@ def motion(
 
 
 def smoothed(
-    start: tuple[float, float],
-    base: FloatArray,
-    slope: FloatArray,
-    models: list[tuple[float, float, bool, float]],
-    transition: FloatArray,
-    initial: FloatArray,
-    slope0: float,
-    width: float,
-    log_likelihood: FloatArray,
-    echo: BoolArray,
-    coast: list[int],
-) -> tuple[Moments, Moments]:
+    start, base, slope, models, transition, initial, slope0, width, log_likelihood, echo, coast
+):
     """What the bins before and at each one say, and what the whole ping says.
 
     start: mean and standard deviation of the base. models: walk, phi, follow and scatter of each.
@@ -115,9 +97,7 @@ def smoothed(
     return before, after
 
 
-def of_bin(
-    p: FloatArray, base: FloatArray, about: list[FloatArray], level: FloatArray, echo: bool
-) -> tuple[float, float, FloatArray]:
+def of_bin(p, base, about, level, echo):
     """Mean and variance of the height of a bin, and the models (M,), given all but its samples
     p (M, B, S) and those, `level` (B,)."""
     height = np.array([each.sum(axis=1) @ kernel for each, kernel in zip(p, about)])

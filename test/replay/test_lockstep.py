@@ -13,7 +13,7 @@ import threading
 from types import SimpleNamespace
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from helpers.fix_bags import COUNT, Ear, write_fixes
+from helpers.node_bench import COUNT, Ear, write_fixes
 import numpy as np
 import pytest
 from rclpy.duration import Duration
@@ -55,12 +55,8 @@ class Live:
         self.link.__exit__()
 
 
-RELIABLE = (
-    '-p',
-    'qos_overrides./fix.subscription.reliability:=reliable',
-    '-p',
-    'qos_overrides./fix.subscription.history:=keep_all',
-)
+QOS = 'qos_overrides./fix.subscription'
+RELIABLE = ('-p', f'{QOS}.reliability:=reliable', '-p', f'{QOS}.history:=keep_all')
 
 
 @pytest.fixture
@@ -120,6 +116,7 @@ def test_a_second_player_counts_from_where_the_node_stands(link, start, stepping
 def test_lockstep_finds_the_only_node_and_asks_where_there_are_two(
     bag, start, domain, monkeypatch
 ):
+    monkeypatch.setattr(lockstep_module, '_OTHER_INPUTS', 0.0)
     start(*RELIABLE)
     result = play(bag, PlayOptions(lockstep='auto'), domain_id=domain)
     assert len(result.delays) == COUNT - 1
@@ -146,8 +143,9 @@ def test_lockstep_without_a_node_says_so(link, stepping):
 
 
 def test_lockstep_names_the_type_the_node_expects(link, start, monkeypatch, stepping):
-    monkeypatch.setattr(lockstep_module, 'MATCH_LIMIT', 3.0)
+    monkeypatch.setattr(lockstep_module, 'MATCH_LIMIT', 0.3)
     start('-p', "input_types:=['fix=geometry_msgs/msg/PointStamped']")
+    assert link.wait_for(lambda: link.node.get_subscriptions_info_by_topic('/fix'), 120.0)
     player, _, _ = stepping(topics=('/fix',))
     with pytest.raises(LinkError, match='expects geometry_msgs/msg/PointStamped on /fix'):
         player.run(start_limit=START_LIMIT)

@@ -12,9 +12,10 @@ import contextlib
 import os
 import threading
 import time
+from types import SimpleNamespace
 
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
-from helpers.fix_bags import COUNT, Ear, START, STEP, write_fixes
+from helpers.node_bench import COUNT, Ear, START, STEP, write_fixes
 import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
@@ -42,6 +43,13 @@ def bag(tmp_path):
     return write_fixes(tmp_path / 'bag')
 
 
+@pytest.fixture(autouse=True)
+def _patience(monkeypatch):
+    """Listeners are waited for, and hear the last message, however busy the machine is."""
+    monkeypatch.setattr(player_module, '_FIRST_LISTENER', 60.0)
+    monkeypatch.setattr(player_module, '_LAST_MESSAGES', 60.0)
+
+
 def test_a_bag_is_played_in_order_with_its_stamps(bag, link, domain):
     ear = Ear(link, PoseWithCovarianceStamped, '/fix')
     progress = []
@@ -52,13 +60,6 @@ def test_a_bag_is_played_in_order_with_its_stamps(bag, link, domain):
     np.testing.assert_array_equal(positions, [np.nan if k == 3 else k for k in range(COUNT)])
     stamp = ear.received[-1].header.stamp
     assert stamp.sec * 10**9 + stamp.nanosec == START + (COUNT - 1) * STEP
-
-
-def test_the_clock_ticks_as_often_as_asked(link):
-    ticker = Ticker(link, 0.01)
-    assert ticker.until_next() == 0.0
-    ticker.tick(START)
-    assert 90.0 < ticker.until_next() <= 100.0
 
 
 def test_topics_remapping_and_offset(bag, link, domain):
@@ -89,7 +90,7 @@ def test_a_stretch_without_a_topic_and_with_another_quality_of_service(bag, link
         assert link.wait_for(ear.subscription.get_publisher_count, 60.0)
         player.run()
         assert player.result().published == 11
-    link.wait_for(lambda: len(ear.received) == 11, 5.0)
+    link.wait_for(lambda: len(ear.received) == 11, 60.0)
     assert [round(message.pose.pose.position.x) for message in ear.received] == list(range(5, 16))
 
 
@@ -107,19 +108,34 @@ def test_playing_to_nobody_is_noticed(bag, domain, monkeypatch):
     assert result.problems == ('nobody was listening when playing began',)
 
 
-def test_pace_maps_both_ways_and_allows_for_pauses():
+def test_pace_maps_both_ways_and_allows_for_pauses(monkeypatch):
+    clock = SimpleNamespace(monotonic=lambda: clock.now, now=1000.0)
+    monkeypatch.setattr(player_module, 'time', clock)
     pace = Pace(START, rate=2.0)
-    assert pace.seconds_until(START + 2 * 10**9) == pytest.approx(1.0, abs=0.05)
+    assert pace.seconds_until(START + 2 * 10**9) == pytest.approx(1.0)
     pace.postpone(3.0)
-    assert pace.seconds_until(START + 2 * 10**9) == pytest.approx(4.0, abs=0.05)
-    assert pace.now_ns() == pytest.approx(START - 6 * 10**9, abs=10**8)
+    assert pace.seconds_until(START + 2 * 10**9) == pytest.approx(4.0)
+    assert pace.now_ns() == START - 6 * 10**9
+    clock.now += 1.5
+    assert pace.now_ns() == START - 3 * 10**9
 
 
-def test_the_clock_runs_along(bag, link, domain):
-    ear = Ear(link, Clock, '/clock')
-    Ear(link, PoseWithCovarianceStamped, '/fix')
-    play(bag, PlayOptions(clock=100.0, topics=('/fix',)), domain_id=domain)
-    link.wait_for(lambda: len(ear.received) >= 5, 10.0)
+def test_the_clock_runs_along_as_often_as_asked(bag, link, domain, monkeypatch):
+    ear, fixes = Ear(link, Clock, '/clock'), Ear(link, PoseWithCovarianceStamped, '/fix')
+    options = PlayOptions(clock=100.0, topics=('/fix',))
+    with BagReader(bag) as reader, Link(NAME, domain_id=domain) as peer:
+        player = Player(reader, peer, options)
+        assert peer.wait_for(player._clock._publisher.get_subscription_count, 60.0)
+        for each in (ear, fixes):
+            assert link.wait_for(each.subscription.get_publisher_count, 60.0)
+        player.run()
+        assert link.wait_for(lambda: len(ear.received) > 1, 60.0)
+        clock = SimpleNamespace(monotonic=lambda: clock.now, now=1000.0)
+        monkeypatch.setattr(player_module, 'time', clock)
+        ticker = Ticker(peer, 0.01)
+        assert ticker.until_next() == 0.0
+        ticker.tick(START)
+        assert ticker.until_next() == pytest.approx(100.0)
     ticks = [tick.clock.sec * 10**9 + tick.clock.nanosec for tick in ear.received]
     assert ticks == sorted(ticks)
     assert START <= ticks[0] <= ticks[-1] <= START + COUNT * STEP
@@ -217,7 +233,7 @@ def test_a_ros_1_bag_is_played_as_ros_2_messages(tmp_path, link, domain):
             writer.write(topic, (100 + k) * 10**9, types.serialize_ros1(message, name))
     ear = Ear(link, PointStamped, '/fix')
     assert play(tmp_path / 'old.bag', PlayOptions(rate=100.0), domain_id=domain).published == 3
-    assert link.wait_for(lambda: len(ear.received) == 3, 10.0)
+    assert link.wait_for(lambda: len(ear.received) == 3, 60.0)
     assert [(m.header.stamp.sec, m.header.frame_id, m.point.x) for m in ear.received] == [
         (100, 'map', 0.0),
         (101, 'map', 1.0),
@@ -283,14 +299,6 @@ def test_a_bag_without_input_is_a_bag_error_and_the_environment_is_as_before(tmp
     with pytest.raises(BagError, match='no topic for the diver tracker'):
         run_lockstep(tmp_path / 'bag', 'diver')
     assert dict(os.environ) == before
-
-
-def test_waiting_ends_by_the_limit_or_by_trouble():
-    with Link('waiter') as link:
-        assert not link.wait_for(lambda: False, 0.05)
-        assert link.wait_for(lambda: True, 0.0)
-        with pytest.raises(LinkError, match='the peer has sunk'):
-            link.wait_for(lambda: False, 10.0, lambda: 'the peer has sunk')
 
 
 # -- The words on the command line of ``play``, and its file of qualities of service --

@@ -6,10 +6,11 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Real processes heed signals, whatever started the tests."""
+"""Real processes heed signals, whatever started the tests; where figures of faults go."""
 
 import signal
 
+from helpers.faults.figures import Figures
 import pytest
 
 
@@ -23,3 +24,21 @@ def _signals_are_heeded():
     yield
     for number in ignored:
         signal.signal(number, signal.SIG_IGN)
+
+
+@pytest.fixture(autouse=True, scope='session')
+def _patience():
+    """Nodes are waited for, however busy the machine is."""
+    from sonar_imm_tools.replay import harness, lockstep
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(harness, '_STOP_LIMIT', 120.0)
+        for name in ('ANSWER_LIMIT', 'MATCH_LIMIT'):
+            patch.setattr(lockstep, name, 120.0)
+        yield
+
+
+@pytest.fixture(scope='module')
+def figures(request):
+    """The rows of the file of this module, e.g. those of ``test_signals.py``."""
+    return Figures(request.module.__name__.rpartition('test_')[2])

@@ -9,19 +9,22 @@
 """Real nodes beside the command: live in lock-step and offline are the same.
 
 The command starts and ends the node itself: that is what is tried, where late input, two nodes in
-a row, positions on Earth or a start come in. Else `conformance/nodes` drives each node in the
-process of the test.
+a row, positions on Earth or a start come in. Else `nodes/test_every_node.py` drives each node in
+the process of the test.
 """
 
 import csv
 import json
 from pathlib import Path
+import shutil
 import signal
 import subprocess
 import sys
 import time
 
 from attrs import evolve
+from helpers.dive_bags import write_dive
+from helpers.source import ROOT
 import numpy as np
 import pytest
 
@@ -33,6 +36,7 @@ from sonar_imm.acoustics import geometry  # noqa: E402
 from sonar_imm.acoustics.geometry import Pose  # noqa: E402
 from sonar_imm.measurements import Start, StaticTransforms  # noqa: E402
 from sonar_imm_tools.cli import main  # noqa: E402
+from sonar_imm_tools.cli.checking import play_recording  # noqa: E402
 from sonar_imm_tools.recordings.messages import ros_message  # noqa: E402
 from sonar_imm_tools.recordings.truth import write_scene  # noqa: E402
 from sonar_imm_tools.recordings.writer import BagWriter  # noqa: E402
@@ -101,14 +105,17 @@ def test_live_lockstep_equals_offline(bags, tmp_path, capsys, name):
         assert run['topics']['/image'] == 'image' and run['detector']['image_far_range'] == 55.0
 
 
+def test_refused_and_late_messages_are_the_same_live_and_offline(tmp_path, capsys):
+    bag = write_dive(tmp_path / 'dive', spoilt=(30, 31), shuffle=True)
+    counts = run_of(checked(capsys, 'diver', bag, tmp_path / 'out'))['counts']
+    assert counts['refused'] == 2 and counts['late'] > 10
+
+
 def test_the_shipped_recordings_of_the_fathometer_pass(tmp_path, capsys):
     assert main(['check', 'fathometer', '--json', '--out', str(tmp_path)]) == 0
     outcomes = json.loads(capsys.readouterr().out)
-    assert [outcome['bag'].rsplit('/', 1)[-1] for outcome in outcomes] == [
-        'fathometer_array',
-        'fathometer_drift',
-        'fathometer_pressure',
-    ]
+    names = [outcome['bag'].rpartition('_')[2] for outcome in outcomes]
+    assert names == ['array', 'drift', 'pressure']
     for outcome in outcomes:
         assert outcome['good'] and len(outcome['checks']) == 4
         assert outcome['checks'][1]['result'] == 'equal bytes'
@@ -132,6 +139,20 @@ def test_a_start_that_was_recorded_counts_live_and_offline(tmp_path, capsys):
     with (offline / 'estimate.csv').open() as lines:
         ids = {row['track_id']: float(row['px']) for row in csv.DictReader(lines)}
     assert len(ids) >= 2 and max(ids.values()) > 300.0  # the second start, 400 m away
+
+
+def test_check_replaces_no_file_of_the_user(tmp_path):
+    """A real node has `state_file`, and saves its state there when it ends."""
+    victim = tmp_path / 'precious'
+    victim.write_text('shopping list')
+    shutil.copytree(ROOT / 'bags' / 'diver_table1', tmp_path / 'bag')
+    (tmp_path / 'bag' / 'parameters.yaml').write_text(
+        f'/**:\n  ros__parameters:\n    state_file: {victim}\n    model_set: heading_speed\n'
+    )
+    played = play_recording(tmp_path / 'bag', 'diver', tmp_path / 'runs', quiet=True)
+    assert all(check.good for check in played.checks)
+    assert victim.read_text() == 'shopping list'
+    assert [path.name for path in tmp_path.glob('precious*')] == ['precious']
 
 
 # -- frames from /tf_static --------------------------------------------------------------------

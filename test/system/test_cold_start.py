@@ -26,8 +26,6 @@ from sonar_imm_tools.replay.link import Link
 
 pytestmark = pytest.mark.system
 LIMIT = 240.0
-ANSWER = 2.0
-"""Seconds in which a service is answered while kernels are compiled."""
 
 
 @pytest.fixture
@@ -51,7 +49,7 @@ def wait_for(node, link, predicate):
 
 def test_a_node_answers_and_reports_while_it_compiles(start):
     node, link = start('bathymetry')
-    reports, answers = [], []
+    reports, answers, longest, begun = [], [], 0.0, time.monotonic()
     link.node.create_subscription(DiagnosticArray, '/diagnostics', reports.append, output_qos())
     client = link.node.create_client(GetParameters, '/bathymetry/get_parameters')
 
@@ -63,13 +61,14 @@ def test_a_node_answers_and_reports_while_it_compiles(start):
     for _ in range(3):
         del reports[:]
         wait_for(node, link, compiles)
-        begun = time.monotonic()
+        asked = time.monotonic()
         request = GetParameters.Request(names=['frame_id'])
         client.call_async(request).add_done_callback(answers.append)
         wait_for(node, link, lambda: answers and answers.pop())
-        assert time.monotonic() - begun < ANSWER
+        longest = max(longest, time.monotonic() - asked)
     assert 'ready, hears' not in node.log()
     wait_for(node, link, lambda: 'ready, hears' in node.log())
+    assert longest < 0.25 * (time.monotonic() - begun)  # however slow the machine is
     assert re.search(r'loading kernels.*\n.*[1-9] kernels compiled, 0 loaded', node.log())
 
 

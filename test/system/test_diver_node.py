@@ -6,107 +6,28 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The real diver node as a process: lock-step against offline, signals, bad parameters.
+"""The real diver node as a process: exit codes, signals, what it is told at its start, its log.
 
-Exit codes, signals and what comes over the middleware are those of a process alone.
+All of that is of a process alone; kernels of the other nodes: test_cold_start.py.
 """
 
+import os
+import shutil
 import signal
 import subprocess
 import sys
 
-from helpers.live import own_words, wait_until_ready
-import numpy as np
+from helpers.faults.cases import BAGS, CASES
+from helpers.faults.rig import own_words, Rig, wait_until_ready
 import pytest
 
-from msg_adapters.fixes import write_fix
-from sonar_imm.intake import KnownFrames
-from sonar_imm.measurements import Fix, Rejection
-from sonar_imm.trackers import SYSTEMS
-from sonar_imm_tools.recordings.measurements import measurements_of
-from sonar_imm_tools.recordings.messages import ros_message
-from sonar_imm_tools.recordings.reader import BagReader
-from sonar_imm_tools.recordings.writer import BagWriter
 from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id, run_lockstep
 from sonar_imm_tools.replay.link import LinkError
 
 pytestmark = pytest.mark.system
 
-START = 1_700_000_000 * 10**9
-SECOND = 10**9
 
-
-@pytest.fixture(scope='module')
-def bag(tmp_path_factory):
-    """Two divers and what a sea trial adds: late, repeated, unusable and far-off fixes."""
-    path = tmp_path_factory.mktemp('bags') / 'rough'
-    rng = np.random.default_rng(20240)
-    with BagWriter(path) as writer:
-        log_ns = START
-        for k in range(120):
-            for diver in (0, 1):
-                late = 3 if k % 11 == 10 else 0
-                stamp = START + (k - late) * SECOND + (late > 0) * SECOND // 3
-                place = np.array([-40.0 + 0.7 * k + 30.0 * diver, 40.0 - 0.5 * k, 0.0])
-                place[:2] += rng.normal(scale=0.3, size=2) + (k % 23 == 22) * 500.0
-                message = write_fix(
-                    Fix(
-                        stamp_ns=stamp, position=place, frame_id='map', covariance=0.09 * np.eye(2)
-                    ),
-                    ros_message,
-                )
-                if k % 17 == 16:
-                    message.pose.pose.position.y = float('inf')
-                if k == 60:
-                    message.header.frame_id = 'odom'
-                log_ns += SECOND // 10
-                writer.write('/usbl/fix', message, log_ns)
-                if k % 19 == 18:
-                    writer.write('/usbl/fix', message, log_ns + 1)
-    return path
-
-
-def offline(path, **parameters):
-    """What the tracker makes of the bag without ROS."""
-    system = SYSTEMS['diver']
-    tracker = system.build(system.config_type()(**parameters))
-    guard, estimates = KnownFrames(), []
-    with BagReader(path) as reader:
-        for received in measurements_of(reader, 'diver'):
-            try:
-                if not isinstance(received.measurement, Rejection):
-                    guard.admit(received.measurement)
-                    estimates += tracker.process(received.measurement)
-            except Rejection:
-                pass
-    return estimates
-
-
-def assert_same_tables(live, recorded):
-    assert [e.stamp_ns for e in live] == [e.stamp_ns for e in recorded]
-    for a, b in zip(live, recorded):
-        assert a.frame_id == b.frame_id
-        left, right = a.columns(), b.columns()
-        assert list(left) == list(right)
-        for name in left:
-            assert left[name].dtype == right[name].dtype, name
-            assert left[name].tobytes() == right[name].tobytes(), name
-
-
-def test_live_lockstep_equals_offline_byte_for_byte(bag):
-    result = run_lockstep(bag, 'diver')
-    expected = offline(bag)
-    assert len(expected) > 100
-    assert_same_tables(result.estimates, expected)
-    assert result.counts.messages == 252
-    assert result.counts.refused > 10
-    assert result.exit_code == 0
-    assert 'Traceback' not in result.log
-    assert 'ready, hears /fix' in result.log
-    assert 0.0 < result.latency_ms()['p50'] <= result.latency_ms()['p99']
-
-
-def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(bag, tmp_path):
+def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(tmp_path):
     file = tmp_path / 'diver.yaml'
     file.write_text('/**:\n  ros__parameters:\n    sound_speed: 1500\n')
     with pytest.raises(
@@ -114,7 +35,7 @@ def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(bag, tmp_path):
         match=r"exit code 2: diver: parameter 'sound_speed' is a "
         r'double: write 1500\.0 instead of 1500',
     ):
-        run_lockstep(bag, 'diver', params_file=file)
+        run_lockstep(BAGS / 'diver_table1', 'diver', params_file=file)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +53,7 @@ def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence)
         reserved_domain_id() as domain,
         NodeProcess('diver', domain_id=domain, arguments=arguments) as node,
     ):
-        assert node.process.wait(120.0) == 2
+        assert node.process.wait(600.0) == 2
         own = ('[rcl]', 'kernels')
         message = own_words(node.log()).splitlines()
         lines = [line for line in message if not any(word in line for word in own)]
@@ -144,7 +65,7 @@ def assert_clean_end(nodes, how):
     for node in nodes:
         node.process.send_signal(how)
     for node in nodes:
-        assert node.process.wait(120.0) == 0, node.log()
+        assert node.process.wait(600.0) == 0, node.log()
         message = own_words(node.log())
         assert 'Traceback' not in message and 'Error' not in message
 
@@ -180,5 +101,93 @@ def test_help_is_said_without_starting():
         reserved_domain_id() as domain,
         NodeProcess('diver', domain_id=domain, arguments=('--', '--help')) as node,
     ):
-        assert node.process.wait(120.0) == 0
+        assert node.process.wait(600.0) == 0
         assert node.log().startswith('usage: diver [--ros-args')
+
+
+# -- its log: a memory card is taken out, a disk is full --
+
+
+def still_answers(rig, times=1):
+    """Whether the node logs, answers and makes estimates as before."""
+    messages = rig.case.messages()[:5]
+    for _ in range(times):
+        rig.reset()  # it logs that
+    return len(rig.play(messages)) >= len(messages) and rig.node.trouble() is None
+
+
+def test_a_node_outlives_the_folder_of_its_log(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    with Rig(CASES['diver']) as rig:
+        assert still_answers(rig)
+        assert list((tmp_path / 'log').iterdir())
+        shutil.rmtree(tmp_path / 'log')
+        assert still_answers(rig, times=3)
+
+
+def test_a_node_outlives_a_full_disk_below_its_log(tmp_path, monkeypatch):
+    mount = ['mount', '-t', 'tmpfs', '-o', 'size=16k', 'tmpfs', str(tmp_path)]
+    if not shutil.which('mount') or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip('no file system may be mounted here')
+    try:
+        monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
+        with Rig(CASES['diver']) as rig:
+            (tmp_path / 'filler').write_bytes(bytes(os.statvfs(tmp_path).f_bavail * 4096))
+            assert not os.statvfs(tmp_path).f_bavail
+            assert still_answers(rig, times=100)
+    finally:
+        subprocess.run(['umount', str(tmp_path)], check=True)
+
+
+# -- a node that is to be secured, and cannot be, does not start without security --
+# The Fast DDS of the wheels of PyPI has no security plugins, which the node then says.
+
+RULES = '<?xml version="1.0" encoding="utf-8"?><dds><domain_access_rules/></dds>'
+
+
+@pytest.fixture
+def keystore(tmp_path):
+    """Keys as `ros2 security create_keystore` and `create_enclave` lay them out."""
+    if shutil.which('openssl') is None:
+        pytest.skip('openssl is not installed')
+    enclave, rules = tmp_path / 'keys' / 'enclaves' / 'sonar_imm' / 'diver', tmp_path / 'rules.xml'
+    enclave.mkdir(parents=True)
+    rules.write_text(RULES)
+    authority, key = tmp_path / 'ca.cert.pem', tmp_path / 'ca.key.pem'
+    curve = ['-newkey', 'ec', '-pkeyopt', 'ec_paramgen_curve:prime256v1', '-nodes', '-days', '9']
+    signed_by = ['-signer', authority, '-inkey', key]
+    for words in (
+        ['req', '-x509', *curve, '-subj', '/CN=sros2CA', '-keyout', key, '-out', authority],
+        [
+            *('req', '-x509', *curve, '-subj', '/CN=diver', '-CA', authority, '-CAkey', key),
+            *('-keyout', enclave / 'key.pem', '-out', enclave / 'cert.pem'),
+        ],
+        ['smime', '-sign', '-text', '-in', rules, '-out', enclave / 'governance.p7s', *signed_by],
+        ['smime', '-sign', '-text', '-in', rules, '-out', enclave / 'permissions.p7s', *signed_by],
+    ):
+        subprocess.run(['openssl', *words], check=True, capture_output=True)
+    for name in ('identity_ca.cert.pem', 'permissions_ca.cert.pem'):
+        shutil.copy(authority, enclave / name)
+    return tmp_path / 'keys'
+
+
+@pytest.mark.parametrize('enclave', ['/sonar_imm/diver', '/sonar_imm/nobody'])
+def test_what_cannot_be_secured_does_not_start(keystore, enclave):
+    with reserved_domain_id() as domain:
+        environment = {
+            **os.environ, 'ROS_DOMAIN_ID': str(domain), 'ROS_SECURITY_KEYSTORE': str(keystore),
+            'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'Enforce',
+        }  # fmt: skip
+        command = [sys.executable, '-m', 'sonar_imm.nodes.diver', '--ros-args', '-e', enclave]
+        try:
+            done = subprocess.run(
+                command, env=environment, capture_output=True, text=True, timeout=240.0
+            )
+        except subprocess.TimeoutExpired:
+            pytest.skip('this Fast DDS has the security plugins, and the node runs')
+    message = own_words(done.stderr)
+    assert done.returncode == 2 and 'Traceback' not in message and 'ready' not in message
+    if enclave.endswith('nobody'):
+        assert "nobody' does not exist" in message
+    else:
+        assert "doesn't have the security libraries" in message

@@ -15,7 +15,7 @@ import subprocess
 import sys
 
 from helpers.dive_bags import write_dive
-from helpers.live import wait_until_ready
+from helpers.faults.rig import wait_until_ready
 from helpers.source import ROOT
 import pytest
 
@@ -29,13 +29,10 @@ pytestmark = pytest.mark.system
 def command(domain, *arguments):
     """A started command in the ROS domain `domain`."""
     return subprocess.Popen(
-        [sys.executable, '-m', 'sonar_imm_tools.cli', *map(str, arguments)],
-        cwd=ROOT,
+        [sys.executable, '-m', 'sonar_imm_tools.cli', *map(str, arguments)], cwd=ROOT,
         env=dict(os.environ, ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST'),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -56,14 +53,14 @@ def playing(tmp_path, monkeypatch):
 
 def test_estimates_are_found_and_shown(playing):
     echoes = {
-        'lines': command(playing, 'echo', '--once', '--timeout', '60'),
+        'lines': command(playing, 'echo', '--once', '--timeout', '300'),
         'json': command(
-            playing, 'echo', 'diver/estimate', '--json', '--count', '3', '--timeout', '60'
+            playing, 'echo', 'diver/estimate', '--json', '--count', '3', '--timeout', '300'
         ),
-        'truth': command(playing, 'echo', '/truth/estimate', '--once', '--timeout', '60'),
+        'truth': command(playing, 'echo', '/truth/estimate', '--once', '--timeout', '300'),
     }
     values = {
-        name: (*echo.communicate(timeout=120), echo.returncode) for name, echo in echoes.items()
+        name: (*echo.communicate(timeout=600), echo.returncode) for name, echo in echoes.items()
     }
     lines = values['lines'][0].splitlines()
     assert 'listening to /diver/estimate' in values['lines'][1]

@@ -12,17 +12,15 @@ Needs the ROS 2 command line and an install of this package on the ament path. P
 elsewhere this is skipped; CONTRIBUTING.md has the procedure.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
-import queue
+from pathlib import Path
 import re
 import shutil
 import signal
 import subprocess
-import threading
 import time
+from typing import NamedTuple
 
 from helpers.source import ROOT
 import pytest
@@ -37,7 +35,7 @@ STOP_LIMIT = 120.0
 
 
 @pytest.fixture
-def ros2() -> str:
+def ros2():
     """The program, when launch and this package can be found by it."""
     pytest.importorskip('launch_xml', reason='ROS 2 launch is not installed')
     packages = pytest.importorskip('ament_index_python.packages')
@@ -63,56 +61,73 @@ def domain():
         }
 
 
+class Output(NamedTuple):
+    """A process, and the file of what it says."""
+
+    process: subprocess.Popen
+    path: Path
+
+    def wait_for(self, matches, names):
+        """Wait until there is a line for which `matches(line, name)` holds, for every name."""
+        end = time.monotonic() + START_LIMIT
+        while True:
+            over = self.process.poll() is not None or time.monotonic() > end
+            lines = self.path.read_text().splitlines()
+            if all(any(matches(line, name) for line in lines) for name in names):
+                return
+            assert not over, '\n'.join(lines)
+            time.sleep(0.1)
+
+
 @contextlib.contextmanager
-def started(words, environment):
-    """A program in a session of its own, as a terminal starts it, and what it says; ends by Ctrl-C
-    to the whole session."""
-    process = subprocess.Popen(
-        [str(word) for word in words],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-    output = Output(process)
+def started(words, environment, log):
+    """A program in a session of its own, as a terminal starts it, which says into the file `log`;
+    ends by Ctrl-C to the whole session."""
+    with log.open('w') as file:
+        process = subprocess.Popen(
+            list(map(str, words)), env=environment, stdout=file, stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )  # fmt: skip
     try:
-        yield output
+        yield Output(process, log)
         os.killpg(process.pid, signal.SIGINT)
         process.wait(STOP_LIMIT)
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-    assert process.returncode in (0, 1), output.rest()  # launch itself answers Ctrl-C with 1
-    assert 'Traceback' not in output.rest()
+    said = log.read_text()
+    assert process.returncode in (0, 1) and 'Traceback' not in said, said  # launch: Ctrl-C is 1
+
+
+@pytest.fixture
+def say(ros2, domain):
+    """What a command prints; asked again until `told` is part of it, as discovery needs."""
+
+    def say(*words, told=''):
+        end, done = time.monotonic() + 120.0, None
+        while done is None or (told not in done.stdout and time.monotonic() < end):
+            done = subprocess.run([ros2, *words], env=domain, capture_output=True, text=True)
+        assert told in done.stdout, (words, done.stdout, done.stderr)
+        return done.stdout
+
+    return say
 
 
 NODES = [*SYSTEMS, 'fls_detector']
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_a_session_with_a_node(ros2, domain, name, tmp_path):
+def test_a_session_with_a_node(ros2, domain, say, name, tmp_path):
     """node, lifecycle, param, topic and service; and what is dumped starts a node that dumps the
     same."""
-
-    def say(*words, told=''):
-        """What a command prints; asked again until `told` is part of it, as discovery needs."""
-        end, done = time.monotonic() + 120.0, None
-        while done is None or (told not in done.stdout and time.monotonic() < end):
-            done = subprocess.run(
-                [ros2, *words], env=domain, capture_output=True, text=True, timeout=120.0
-            )
-        assert told in done.stdout, (words, done.stdout, done.stderr)
-        return done.stdout
-
     file = tmp_path / f'{name}.yaml'
-    run = [ros2, 'run', 'sonar_imm', f'{name}_node', '--ros-args']
+    log, run = tmp_path / 'log', [ros2, 'run', 'sonar_imm', f'{name}_node', '--ros-args']
     more = []
     if name == 'fls_detector':  # the default needs a package
         more = ['-p', "input_types:=['image=sensor_msgs/msg/Image']"]
     managed = 'std_srvs/srv/Trigger' if name in SYSTEMS else ''
-    with started([*run, '-p', 'autostart:=false', *more], domain) as output:
+    with started([*run, '-p', 'autostart:=false', *more], domain, log) as output:
         say('node', 'list', told=f'/{name}\n')
         assert say('lifecycle', 'get', f'/{name}', told='[').strip() == 'unconfigured [1]'
         say('lifecycle', 'set', f'/{name}', 'configure', told='Transitioning successful')
@@ -130,26 +145,26 @@ def test_a_session_with_a_node(ros2, domain, name, tmp_path):
         say('lifecycle', 'set', f'/{name}', 'deactivate', told='Transitioning successful')
     assert yaml.safe_load(file.read_text())[f'/{name}']['ros__parameters']['stale_after'] == 7.5
     # The file comes first: what is told before it, for all nodes, gives way to all of the file.
-    with started([*run, '--params-file', file, '-p', 'autostart:=true'], domain) as output:
+    with started([*run, '--params-file', file, '-p', 'autostart:=true'], domain, log) as output:
         output.wait_for(lambda line, node: 'ready, hears' in line, [name])
         again = say('param', 'dump', f'/{name}', told='ros__parameters')
     assert again == file.read_text().replace('autostart: false', 'autostart: true')
 
 
 @pytest.mark.parametrize(
-    ('name', 'nodes'),
-    [('diver', ['auv.diver']), ('all', [f'auv.{system}' for system in SYSTEMS])],
+    ('name', 'nodes'), [('diver', ['auv.diver']), ('all', [f'auv.{system}' for system in SYSTEMS])]
 )
-def test_launched_nodes_get_ready_in_their_namespace_and_end_on_ctrl_c(ros2, domain, name, nodes):
+def test_launched_nodes_get_ready_and_end_on_ctrl_c(ros2, domain, name, nodes, tmp_path):
+    """In their namespace."""
     words = [ros2, 'launch', 'sonar_imm', f'{name}.launch.xml', 'namespace:=/auv']
-    with started(words, domain) as output:
+    with started(words, domain, tmp_path / 'log') as output:
         output.wait_for(lambda line, node: f'[{node}]' in line and 'ready' in line, nodes)
-    rest = output.rest()
-    assert 'process has died' not in rest
-    assert rest.count('process has finished cleanly') == len(nodes)
+    said = output.path.read_text()
+    assert 'process has died' not in said
+    assert said.count('process has finished cleanly') == len(nodes)
 
 
-def test_the_launch_file_of_the_tutorial_runs(ros2, domain, tmp_path):
+def test_the_launch_file_of_the_tutorial_runs(ros2, domain, say, tmp_path):
     """Its obstacle node hears what the page renames, with the parameters of the page."""
     packages = pytest.importorskip('ament_index_python.packages')
     try:
@@ -162,46 +177,10 @@ def test_the_launch_file_of_the_tutorial_runs(ros2, domain, tmp_path):
     file, params_file = tmp_path / 'avoidance.launch.xml', tmp_path / 'my_obstacle.yaml'
     params_file.write_text(parameters)
     file.write_text(text.replace('/home/auv/my_obstacle.yaml', str(params_file)))
-    with started([ros2, 'launch', file], domain) as output:
+    with started([ros2, 'launch', file], domain, tmp_path / 'log') as output:
         output.wait_for(
             lambda line, topic: 'ready, hears' in line and topic in line,
             ['/sonar/targets', '/ekf/odometry'],
         )
-        words = [ros2, 'param', 'get', '/obstacle', 'safety_radius']
-        told = subprocess.run(words, env=domain, capture_output=True, text=True, timeout=60.0)
-        assert '4.0' in told.stdout
-    assert 'process has died' not in output.rest()
-
-
-class Output:
-    """What a process prints, read in a thread so that waiting for a line has a limit."""
-
-    def __init__(self, process: subprocess.Popen[str]):
-        self._process = process
-        self._lines: queue.Queue[str] = queue.Queue()
-        self._printed = ''
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        for line in self._process.stdout:
-            self._lines.put(line)
-
-    def wait_for(self, matches, names: list[str]) -> None:
-        """Read on until a line has come for which `matches(line, name)` holds, for every name."""
-        waiting, end = set(names), time.monotonic() + START_LIMIT
-        while waiting and time.monotonic() < end and self._process.poll() is None:
-            try:
-                line = self._lines.get(timeout=0.5)
-            except queue.Empty:
-                continue
-            self._printed += line
-            waiting = {name for name in waiting if not matches(line, name)}
-        assert not waiting, self._printed
-
-    def rest(self) -> str:
-        """Everything that was printed, once the process has ended."""
-        self._reader.join(STOP_LIMIT)
-        while not self._lines.empty():
-            self._printed += self._lines.get()
-        return self._printed
+        say('param', 'get', '/obstacle', 'safety_radius', told='4.0')
+    assert 'process has died' not in output.path.read_text()

@@ -12,9 +12,6 @@ A fenced block `bash` is run; the lines of a block `text` have to be in what it 
 order. Numbers may differ by 5 %, or by one in the last digit; `...` stands for what is not shown.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 import contextlib
 import math
 import os
@@ -46,14 +43,14 @@ change with each commit."""
 TURN = 2 * commits() % len(HOWTO)
 PAGES = [*TUTORIALS, *(HOWTO if EVERY else (2 * HOWTO)[TURN : TURN + 2])]
 NUMBER = re.compile(r'-?\d+(?:\.\d+)?|-?\.\d+')
-LONGEST = 300.0
+LONGEST = 600.0
 """Seconds that a page may take on a busy machine."""
 
 
-def blocks(page: str) -> list[tuple[str, str]]:
+def blocks(page):
     """Commands and what they print, which is '' where the page does not show it."""
     found = re.findall(r'^```(bash|text)\n(.*?)^```$', page, re.MULTILINE | re.DOTALL)
-    given: list[tuple[str, str]] = []
+    given = []
     for kind, text in found:
         if kind == 'bash':
             given.append((text, ''))
@@ -63,7 +60,7 @@ def blocks(page: str) -> list[tuple[str, str]]:
     return given
 
 
-def same(shown: str, printed: str) -> bool:
+def same(shown, printed):
     """Whether a line says the same: the words are equal, the numbers nearly."""
     if NUMBER.sub('#', ' '.join(shown.split())) not in NUMBER.sub('#', ' '.join(printed.split())):
         return False
@@ -73,14 +70,14 @@ def same(shown: str, printed: str) -> bool:
     return found is not None and all(map(near, NUMBER.findall(shown), found.groups()))
 
 
-def near(shown: str, printed: str) -> bool:
+def near(shown, printed):
     digits = len(shown.partition('.')[2])
     return math.isclose(
         float(shown), float(printed), rel_tol=0.05, abs_tol=1.01 * 10.0**-digits if digits else 0.0
     )
 
 
-def missing(shown: str, printed: str) -> str | None:
+def missing(shown, printed):
     """The first line that was shown and not printed after those before it."""
     lines = iter(printed.splitlines())
     for line in filter(str.strip, shown.splitlines()):
@@ -90,13 +87,13 @@ def missing(shown: str, printed: str) -> str | None:
 
 
 @pytest.fixture(scope='module')
-def command(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def command(tmp_path_factory):
     with commands(tmp_path_factory.mktemp('command')) as folder:
         yield folder
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda path: f'{path.parent.name}/{path.stem}')
-def test_the_commands_of_a_page_run(page: Path, tmp_path: Path, command: Path) -> None:
+def test_the_commands_of_a_page_run(page, tmp_path, command):
     pytest.importorskip('rclpy')
     given = blocks(page.read_text(encoding='utf-8'))
     mark = '=== block'
@@ -117,14 +114,9 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path, command: Path) -
     with reserved_domain_id() as domain, output.open('w', encoding='utf-8') as log:
         environment['ROS_DOMAIN_ID'] = str(domain)
         shell = subprocess.Popen(
-            ['bash', '-eu', '-o', 'pipefail', '-c', script],
-            cwd=tmp_path,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
+            ['bash', '-eu', '-o', 'pipefail', '-c', script], cwd=tmp_path, env=environment,
+            stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
+        )  # fmt: skip
         try:
             status = shell.wait(LONGEST)
         except subprocess.TimeoutExpired:
@@ -138,7 +130,7 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path, command: Path) -
         assert missing(shown, part) is None, f'not printed: {missing(shown, part)}\n{part}'
 
 
-def test_a_line_that_was_not_printed_is_found() -> None:
+def test_a_line_that_was_not_printed_is_found():
     printed = 'used 198\n  error 1.142 m\ndone 3\n'
     assert missing('used 198\n...\ndone 3\n', printed) is None
     assert missing('error 1.15 m\n', printed) is None
@@ -147,7 +139,7 @@ def test_a_line_that_was_not_printed_is_found() -> None:
     assert missing('used 198 times\n', printed) == 'used 198 times'
 
 
-def test_all_tutorials_are_run() -> None:
+def test_all_tutorials_are_run():
     from sonar_imm.trackers import SYSTEMS
 
     assert {path.stem for path in PAGES if path.parent.name == 'tutorials'} >= set(SYSTEMS)

@@ -6,14 +6,16 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Scores of runs whose errors are known."""
+"""Scores of divers whose errors are known; how they are matched and drawn."""
 
+from itertools import permutations
 import json
 
 from attrs import evolve
 from helpers.dive_scenes import (
     covariance,
     estimate_at,
+    HEADINGS,
     legs,
     SECOND,
     single_run,
@@ -23,12 +25,21 @@ from helpers.dive_scenes import (
 )
 import numpy as np
 import pytest
+from scipy.stats import chi2, norm
 
 from sonar_imm.measurements import Fix
-from sonar_imm_tools.evaluation.diver import METRICS, summary_sentence
+from sonar_imm_tools.evaluation.diver import figures, METRICS, summary_sentence
 from sonar_imm_tools.evaluation.diver.scoring import fix_series, score
-from sonar_imm_tools.evaluation.diver.series import series_of, Truth
+from sonar_imm_tools.evaluation.diver.series import (
+    assign,
+    match,
+    series_of,
+    track_summary,
+    Truth,
+    TruthPath,
+)
 from sonar_imm_tools.evaluation.numbers import lines
+from sonar_imm_tools.evaluation.plotting import view_of
 from sonar_imm_tools.offline.run_folder import finite
 
 
@@ -272,3 +283,249 @@ def test_the_raw_fixes_may_be_the_truth_itself():
     assert 'the truth itself' in summary_sentence(words_of(0.5, 0.0))
     assert 'removes 75 %' in summary_sentence(words_of(0.5, 2.0))
     assert 'adds 100 %' in summary_sentence(words_of(2.0, 1.0))
+
+
+def test_ellipses_hold_the_probability_they_claim():
+    covariance = np.array([[[4.0, 1.2], [1.2, 1.0]]])
+    mean = np.array([[3.0, -2.0]])
+    outline = figures.outlines(mean, covariance, probability=0.9)
+    assert np.isnan(outline[-1]).all()
+    offset = outline[:-1] - mean
+    distance = np.einsum('ni,ij,nj->n', offset, np.linalg.inv(covariance[0]), offset)
+    np.testing.assert_allclose(distance, chi2.ppf(0.9, 2), rtol=1e-12)
+
+
+def test_models_are_ordered_by_heading_with_the_others_below():
+    names = ('heading_090', 'hover', 'heading_000')
+    order = [names[i] for i in figures.model_order(names)]
+    assert order == ['hover', 'heading_000', 'heading_090']
+    assert figures.model_label('heading_022') == '22°'
+
+
+def test_the_same_heading_of_two_families_is_one_row():
+    names = ('steady_heading_000', 'steady_hover', 'brisk_heading_000', 'brisk_hover', 'quiet')
+    found, added = figures.headings_together(names, np.array([[0.1, 0.2, 0.3, 0.25, 0.15]]))
+    assert found == ('heading_000', 'hover', 'quiet')
+    np.testing.assert_allclose(added, [[0.4, 0.45, 0.15]])
+    alone = figures.headings_together(('heading_000', 'hover'), np.eye(2))
+    assert alone[0] == ('heading_000', 'hover')
+    np.testing.assert_array_equal(alone[1], np.eye(2))
+
+
+def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
+    estimates, true_rows, _ = single_run(count=60)
+    truth, clutter = Truth.from_series(series_of(true_rows)), np.array([[500.0, 500.0]])
+    series = series_of(estimates)
+    fixes = fix_series([Fix(stamp_ns=1, position=[*clutter[0], 0.0])])
+    assert fixes.place_covariance.shape == (1, 3, 3)
+    figure = figures.map_figure(series, truth, fixes)
+    low, high = figure.layout.xaxis.range
+    assert low < series.state[:, 0].min() and series.state[:, 0].max() < high < 500.0
+    assert figure.layout.yaxis.scaleanchor == 'x'
+    assert view_of(np.empty((0, 2))) == (None, None)
+
+
+def test_tracks_have_the_names_of_their_targets():
+    estimates, _, _ = single_run(count=20)
+    series = series_of(estimates)
+    series.target_id[:] = 4
+    drawn = figures.map_figure(series, None, None, {'4': 'Schmidt <b>'})
+    (track,) = np.unique(series.track_id)
+    assert f'Schmidt &lt;b&gt; (track {track})' in {each.name for each in drawn.data}
+    section = next(iter(figures.sections({}, series, names={'4': 'Schmidt'})))
+    assert f'Schmidt (track {track})' in {each.name for each in section.figure.data}
+
+
+def test_the_error_of_a_track_is_drawn_over_the_seconds_of_the_run_in_its_band():
+    estimates, true_rows, times = single_run(count=60)
+    series = series_of(estimates)
+    series.track_id[:10] = 6  # another track goes before
+    matching = match(series, Truth.from_series(series_of(true_rows)), cutoff=10.0)
+    figure = figures.error_figure(matching, 7)
+    axes = {name for name in figure.to_dict()['layout'] if name.startswith('yaxis')}
+    assert axes == {'yaxis', 'yaxis2'}
+    drawn = figure.data
+    lines = [line for line in drawn if line.name == 'error of the track']
+    bands = [line for line in drawn if line.name == 'predicted 95 % band']
+    assert len(lines) == len(bands) == 2
+    for axis, line in enumerate(lines):
+        np.testing.assert_allclose(line.x, times[10:], atol=1e-3)
+        np.testing.assert_allclose(line.y, matching.error[10:, axis], atol=1e-3)
+        half = norm.ppf(0.975) * np.sqrt(covariance()[axis, axis])
+        np.testing.assert_allclose(np.sort(bands[axis].y), np.repeat([-half, half], 50), rtol=1e-3)
+
+
+# -- who follows whom, against brute force and by hand --------------------------------------------
+
+
+def scene(rows_by_scan, ids_by_scan, *, targets=((0.0, 0.0), (30.0, 0.0)), cutoff=10.0):
+    """Standing targets; estimates at the given places with the given track ids."""
+    estimates, truths = [], []
+    for k, (places, ids) in enumerate(zip(rows_by_scan, ids_by_scan)):
+        stamp = START_NS + k * SECOND
+        states = np.array([[*place, 0.0, 0.0] for place in places]).reshape(-1, 4)
+        estimates.append(estimate_at(stamp, states, ids))
+        there = [[*target, 0, 0] for target in targets]
+        truths.append(truth_estimate(stamp, there, range(len(targets))))
+    return match(series_of(estimates), Truth.from_series(series_of(truths)), cutoff=cutoff)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_assignment_has_the_least_total_of_all_assignments(seed):
+    distance = np.random.default_rng(seed).uniform(0.0, 10.0, (3, 4))
+    best = min(sum(distance[i, p[i]] for i in range(3)) for p in permutations(range(4), 3))
+    pairs = assign(distance, np.inf)
+    assert sum(distance[pair] for pair in pairs) == pytest.approx(best)
+    # Pairs beyond the cutoff are none.
+    assert assign(np.array([[9.9, 50.0], [50.0, 10.0]]), 10.0) == [(0, 0)]
+
+
+def test_what_is_left_over_on_both_sides_is_kept_apart():
+    matching = scene([[(1.0, 0.0), (60.0, 0.0)], [(30.0, 0.0)]], [[1, 2], [2]])
+    assert matching.distance.tolist() == [1.0, 0.0]
+    assert matching.beyond_row.tolist() == [1]
+    assert matching.beyond_truth[:, 0].tolist() == [30.0]
+
+
+def test_one_target_with_one_track_is_matched_however_far():
+    matching = scene([[(1000.0, 0.0)]], [[7]], targets=[(0.0, 0.0)])
+    assert matching.distance.tolist() == [1000.0]
+
+
+def test_errors_are_estimate_minus_truth():
+    matching = scene([[(31.0, -2.0), (0.5, 0.0)]], [[2, 1]])
+    order = np.argsort(matching.target)
+    np.testing.assert_allclose(matching.error[order, :2], [[0.5, 0.0], [1.0, -2.0]])
+
+
+def test_an_identity_switch_is_counted_once_and_a_gap_is_none():
+    places = [[(0, 0), (30, 0)]] * 3 + [[(30, 0)]] + [[(0, 0), (30, 0)]] * 2
+    ids = [[1, 2], [1, 2], [2, 1], [1], [2, 1], [2, 1]]
+    summary = track_summary(scene(places, ids))
+    assert summary['identity_switches'] == 2
+    assert summary['fragmentations'] == 1
+    assert summary['completeness'] == pytest.approx(11 / 12)
+    assert summary['false_tracks'] == 0
+
+
+def test_a_track_on_nothing_is_false_and_no_estimates_find_nothing():
+    places = [[(0, 0), (30, 0), (15, 200)]] * 4
+    summary = track_summary(scene(places, [[1, 2, 3]] * 4))
+    assert summary['false_tracks'] == 1 and summary['tracks'] == 3
+    assert summary['false_rows_per_scan'] == 1.0 and summary['true_targets'] == 2
+    matching = scene([[]], [[]])
+    assert len(matching.row) == 0 and track_summary(matching)['completeness'] == 0.0
+
+
+def test_scans_without_truth_are_not_scored():
+    estimates = [estimate_at(START_NS + k * SECOND, [[0.0, 0.0, 0.0, 0.0]], [1]) for k in range(5)]
+    truths = [truth_estimate(START_NS + k * SECOND, [[0.0, 0.0, 0.0, 0.0]], [1]) for k in (1, 2)]
+    matching = match(series_of(estimates), Truth.from_series(series_of(truths)), cutoff=10.0)
+    assert len(matching.scan_ns) == 2 and matching.scored.sum() == 2
+
+
+# -- estimates as flat arrays ---------------------------------------------------------------------
+
+STATES = np.array([[1.0, 2.0, 0.5, -0.5], [3.0, 4.0, 0.0, 0.8]])
+
+
+def test_rows_come_out_by_stamp_with_their_columns():
+    late = estimate_at(START_NS + 5, STATES, [4, 9], nis=[1.5, np.nan])
+    early = estimate_at(START_NS, STATES[:1], [4])
+    series = series_of([late, early])
+    assert series.stamp_ns.tolist() == [START_NS, START_NS + 5, START_NS + 5]
+    assert series.track_id.tolist() == [4, 4, 9]
+    np.testing.assert_array_equal(series.state[1:], STATES)
+    np.testing.assert_array_equal(series.covariance[2], covariance())
+    assert series.model_names == HEADINGS
+    assert series.nis[1] == 1.5 and np.isnan(series.nis[0])
+
+
+def test_scans_without_rows_are_remembered_and_nothing_makes_an_empty_series():
+    nothing = estimate_at(START_NS, np.empty((0, 4)), [])
+    series = series_of([nothing, estimate_at(START_NS + 1, STATES[:1], [4])])
+    assert series.scan_ns.tolist() == [START_NS, START_NS + 1]
+    assert len(series) == 1
+    series = series_of([])
+    assert len(series) == 0 and len(series.scan_ns) == 0
+    assert series.longest_track() is None
+
+
+def test_truth_states_no_covariance():
+    series = series_of([truth_estimate(START_NS, STATES, [1, 2])])
+    np.testing.assert_array_equal(series.state, STATES)
+    assert np.isnan(series.covariance).all()
+
+
+def test_tentative_rows_are_left_out_of_confirmed():
+    first, tentative = (
+        estimate_at(START_NS + k, STATES[:1], [4], tentative=k == 0) for k in (1, 0)
+    )
+    assert series_of([tentative, first]).confirmed().stamp_ns.tolist() == [START_NS + 1]
+
+
+def test_a_table_of_something_else_and_two_runs_in_one_are_refused():
+    other = truth_estimate(START_NS, STATES, [1, 2])
+    del other.extras['py']
+    with pytest.raises(ValueError, match="no column 'py'"):
+        series_of([other])
+    first = estimate_at(START_NS, STATES[:1], [4])
+    one = np.ones((1, 1))
+    second = evolve(first, stamp_ns=START_NS + 1, model_names=('cv',), probabilities=one)
+    with pytest.raises(ValueError, match='more than one run'):
+        series_of([first, second])
+
+
+# -- truth ----------------------------------------------------------------------------------------
+
+PATH = TruthPath(
+    1,
+    START_NS + np.array([0, 2, 100]) * SECOND,
+    np.array([[0.0, 0.0, 1.0, 0.0], [4.0, -2.0, 3.0, 1.0], [9.0, 9.0, 0.0, 0.0]]),
+)
+
+
+def at(seconds, **options):
+    stamps = START_NS + np.round(np.atleast_1d(seconds) * SECOND).astype(np.int64)
+    return PATH.at(stamps, **{'max_gap': 10.0, **options})
+
+
+def test_between_two_points_truth_is_a_straight_line():
+    np.testing.assert_allclose(at(0.5)[0], [1.0, -0.5, 1.5, 0.25], atol=1e-12)
+
+
+@pytest.mark.parametrize('seconds', [-0.001, 100.001])
+def test_beyond_its_ends_truth_is_unknown(seconds):
+    assert np.isnan(at(seconds)).all()
+
+
+def test_across_a_long_gap_truth_is_unknown_but_its_ends_are_known():
+    assert np.isnan(at(50.0)).all()
+    np.testing.assert_array_equal(at([2.0, 100.0])[:, 0], [4.0, 9.0])
+    assert np.isfinite(at(50.0, max_gap=98.0)).all()
+
+
+def test_nanoseconds_are_not_lost_in_big_stamps():
+    fast = TruthPath(1, START_NS + np.array([0, 1000]), np.array([[0.0] * 4, [1000.0] * 4]))
+    assert fast.at(np.array([START_NS + 7]), max_gap=1.0)[0, 0] == pytest.approx(7.0, abs=1e-9)
+
+
+def test_a_lag_compares_with_later_truth():
+    shifted = Truth((PATH,)).shifted(0.5)
+    np.testing.assert_allclose(shifted.at(np.array([START_NS]))[0, 0], at(0.5)[0])
+
+
+def test_targets_are_told_apart_and_bad_rows_left_out():
+    rows = [
+        truth_estimate(START_NS + k, [[k, 0, 0, 0], [5, k if k else np.nan, 0, 0]], [1, 2])
+        for k in range(3)
+    ]
+    truth = Truth.from_series(series_of(rows))
+    assert [path.track_id for path in truth.paths] == [1, 2]
+    assert [len(path.stamp_ns) for path in truth.paths] == [3, 2]
+
+
+def test_of_repeated_stamps_the_last_counts():
+    rows = [truth_estimate(START_NS, [[x, 0, 0, 0]], [1]) for x in (1.0, 2.0)]
+    (path,) = Truth.from_series(series_of(rows)).paths
+    assert path.state[:, 0].tolist() == [2.0]

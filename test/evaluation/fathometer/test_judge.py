@@ -19,7 +19,7 @@ from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.evaluation.fathometer import LIMIT
+from sonar_imm_tools.evaluation.fathometer import figures, LIMIT
 from sonar_imm_tools.evaluation.fathometer.crossing import (
     common_shift,
     compared,
@@ -28,13 +28,6 @@ from sonar_imm_tools.evaluation.fathometer.crossing import (
     Horizon,
     mistie_figure,
     summary,
-)
-from sonar_imm_tools.evaluation.fathometer.figures import (
-    Image,
-    MOST_DEPTHS,
-    MOST_RECORDS,
-    response_figure,
-    response_image,
 )
 from sonar_imm_tools.evaluation.fathometer.predictive import for_tuning, Scored, tunables
 from sonar_imm_tools.evaluation.fathometer.scoring import (
@@ -138,7 +131,7 @@ def test_a_whole_run_is_judged_and_told(run, capsys):
 def test_the_image_is_what_the_tracker_saw(run):
     content = run.read_run()
     traces = [item for item in read_measurements(content) if isinstance(item, Trace)]
-    image = response_image(content)
+    image = figures.response_image(content)
     assert image.value.shape == (len(traces[0]), len(traces))
     expected = traces[5].amplitude / traces[5].sigma
     assert np.allclose(image.value[:, 5], expected, rtol=1e-4, atol=1e-4)
@@ -147,11 +140,11 @@ def test_the_image_is_what_the_tracker_saw(run):
 
 def test_a_thin_reflector_does_not_vanish_from_a_long_recording():
     """Of an image with more depths and records than are drawn, the largest of a few is."""
-    value = np.zeros((2 * MOST_DEPTHS, 3 * MOST_RECORDS))
+    value = np.zeros((2 * figures.MOST_DEPTHS, 3 * figures.MOST_RECORDS))
     value[301, 604] = 9.0
     depth, stamp_ns = 0.1 * np.arange(len(value)), 10**9 * np.arange(value.shape[1])
-    (drawn,) = response_figure(Image(value, depth, stamp_ns), [], 0).data
-    assert drawn.z.shape == (MOST_DEPTHS, MOST_RECORDS)
+    (drawn,) = figures.response_figure(figures.Image(value, depth, stamp_ns), [], 0).data
+    assert drawn.z.shape == (figures.MOST_DEPTHS, figures.MOST_RECORDS)
     [[row, column]] = np.argwhere(drawn.z)
     assert drawn.z[row, column] == 9.0
     assert drawn.y[row] == pytest.approx(30.1, abs=0.1)

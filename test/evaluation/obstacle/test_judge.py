@@ -11,7 +11,7 @@
 import json
 
 from attrs import evolve
-from helpers.obstacle_bags import tracked
+from helpers.obstacle_runs import tracked_by_command as tracked
 import numpy as np
 import pytest
 from scipy.special import ndtr

@@ -8,8 +8,6 @@
 
 """The recordings that faults are done to: for each node the first messages of a shipped bag."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import copy
 import functools
@@ -39,21 +37,21 @@ class Message:
     origin_ns: int
 
     @property
-    def stamp_ns(self) -> int:
+    def stamp_ns(self):
         stamp = self.content.header.stamp
         return stamp.sec * SECOND + stamp.nanosec
 
-    def changed(self, change: Callable[[Any], None]) -> Message:
+    def changed(self, change):
         """The message with a changed copy of its content."""
         content = copy.deepcopy(self.content)
         change(content)
         return evolve(self, content=content)
 
-    def moved(self, seconds: float) -> Message:
+    def moved(self, seconds):
         """The message with a stamp that is later by `seconds`."""
         stamp_ns = self.stamp_ns + round(seconds * SECOND)
 
-        def move(content: Any) -> None:
+        def move(content):
             content.header.stamp.sec, content.header.stamp.nanosec = divmod(stamp_ns, SECOND)
 
         return self.changed(move)
@@ -85,16 +83,16 @@ class Case:
     repeat: int = 1
 
     @property
-    def period(self) -> float:
+    def period(self):
         """Seconds between two messages of the primary input."""
         stamps = [message.origin_ns for message in self.messages() if message.primary]
         return (stamps[-1] - stamps[0]) / (len(stamps) - 1) / SECOND
 
-    def messages(self) -> tuple[Message, ...]:
+    def messages(self):
         """What is sent when nothing goes wrong."""
         return _messages(self)
 
-    def thirds(self) -> tuple[list[Message], list[Message], list[Message]]:
+    def thirds(self):
         """The messages before, during and after a fault, as many of the primary input each."""
         messages = self.messages()
         places = [k for k, message in enumerate(messages) if message.primary]
@@ -103,7 +101,7 @@ class Case:
 
 
 @functools.cache
-def _messages(case: Case) -> tuple[Message, ...]:
+def _messages(case):
     with BagReader(BAGS / case.bag) as bag:
         names = {entry.name for entry in inputs_of(case.system)}
         there = {topic.name: topic.name.lstrip('/') for topic in bag.topics}
@@ -120,7 +118,7 @@ def _messages(case: Case) -> tuple[Message, ...]:
         ]
     stamps = [item.stamp_ns for item in recorded if item.primary]
     length = stamps[-1] - stamps[0] + (stamps[-1] - stamps[0]) // (len(stamps) - 1)
-    played: list[Message] = []
+    played = []
     for turn in range(case.repeat):
         for each in recorded:
             again = each.moved(turn * length / SECOND)

@@ -12,9 +12,6 @@ The long form runs when ``SONAR_IMM_FIGURES`` names a folder: everything is trie
 and each part writes a file there. `make reliability` does that.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 import json
 import os
 from pathlib import Path
@@ -27,12 +24,12 @@ SHARE = float(os.environ.get('SONAR_IMM_SHARE', '1.0'))
 """Of the tries of the long form; below 1 every fault is tried on one node only."""
 
 
-def long_form() -> bool:
+def long_form():
     """Whether everything is to be tried, not a share of it."""
     return bool(FOLDER) and SHARE >= 1.0
 
 
-def count(short: int, long: int) -> int:
+def count(short, long):
     """How often something is tried."""
     return max(short, round(SHARE * long)) if FOLDER else short
 
@@ -41,18 +38,18 @@ class Figures:
     """The rows of one part, written as they come; nothing in the short form. What is in the folder
     already is taken over: a long form that was broken off goes on."""
 
-    def __init__(self, part: str):
+    def __init__(self, part):
         self._path = Path(FOLDER) / f'{part}.json' if FOLDER else None
         self.rows: list[dict[str, Any]] = []
         if self._path and self._path.is_file():
             self.rows = json.loads(self._path.read_text(encoding='utf-8'))
 
-    def skip_if_measured(self, tries: int = 0, **key: Any) -> None:
+    def skip_if_measured(self, tries=0, **key):
         """Skip the test when its row is there, of as many `tries`."""
         if any(_is_of(row, key) and row.get('tried', tries) >= tries for row in self.rows):
             pytest.skip('measured already')
 
-    def add(self, key: Mapping[str, Any], **values: Any) -> None:
+    def add(self, key, **values):
         """Add the row of `key`, instead of one that is there."""
         self.rows = [row for row in self.rows if not _is_of(row, key)] + [{**key, **values}]
         if self._path:
@@ -63,5 +60,5 @@ class Figures:
             whole.replace(self._path)
 
 
-def _is_of(row: Mapping[str, Any], key: Mapping[str, Any]) -> bool:
+def _is_of(row, key):
     return all(row.get(name) == value for name, value in key.items())

@@ -8,10 +8,7 @@
 
 """A real node as a process, what is sent to it and what it says: where faults happen."""
 
-from __future__ import annotations
-
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
 import os
 from pathlib import Path
@@ -26,7 +23,6 @@ import numpy as np
 import pytest
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from scipy.stats import chi2
 from std_srvs.srv import SetBool, Trigger
@@ -43,13 +39,13 @@ from sonar_imm_tools.replay.harness import (
 from sonar_imm_tools.replay.link import Link
 from sonar_imm_tools.replay.lockstep import LockStep, Recorder
 
-from .cases import Action, Case, Message, SECOND, Step
+from .cases import Action, Message, SECOND
 
 TESTS = str(Path(__file__).resolve().parents[2])
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 NO_LOSS = re.compile(r'count: (used|late|poses|restarts|bins.*)$|.* received$|doubtful: .*')
 """Counts of what was not lost."""
-_PATIENCE = 120.0
+_PATIENCE = 300.0
 """Seconds of waiting for what comes soon where a machine is not loaded."""
 _REPORTS = 12
 """Reports of /diagnostics in a disturbed part, a third or more of which is the fault."""
@@ -79,20 +75,20 @@ class Diagnostics:
     levels: set[str] = field(factory=set)
     words: set[str] = field(factory=set)
 
-    def __call__(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
+    def __call__(self, message, info):
         self.newest_ns = info['source_timestamp']
         for status in message.status:
             self.values |= {pair.key: pair.value for pair in status.values}
             self.levels.add(LEVELS[ord(status.level)])
             self.words.add(f'{LEVELS[ord(status.level)]}: {status.message}')
 
-    def forget(self) -> None:
+    def forget(self):
         self.levels.clear()
         self.words.clear()
 
-    def counts(self) -> Counter[str]:
+    def counts(self):
         """All values that count something."""
-        counts: Counter[str] = Counter()
+        counts = Counter()
         for key, value in self.values.items():
             if re.match(r'(count|refused|doubtful|lost|gap|dropped)\b|.*(received|dropped)', key):
                 with contextlib.suppress(ValueError):
@@ -101,7 +97,7 @@ class Diagnostics:
 
 
 @contextlib.contextmanager
-def without_shared_memory() -> Iterator[None]:
+def without_shared_memory():
     """Let what is started meanwhile meet over UDP only: whoever shares memory with a node when it
     is killed may crash when it ends itself, in Fast DDS 2.14 one time in ninety on a busy
     machine."""
@@ -115,25 +111,23 @@ class Rig:
     """A node of one system in a ROS domain of its own, in lock-step; ended by ``with``."""
 
     def __init__(
-        self,
-        case: Case,
-        arguments: Sequence[str] = (),
-        *,
-        lossless: bool = True,
-        discovery: Callable[[], contextlib.AbstractContextManager[None]] = local_discovery,
+        self, case, arguments=(), *, lossless=True, connected=True, discovery=local_discovery
     ):
         """Start it. lossless: whether inputs are reliable and of any length, as lock-step needs
-        for many messages; else they are as the node has them. discovery: how link and node find
-        each other, `without_shared_memory` where the node is killed."""
+        for many messages; else they are as the node has them. connected: whether it is waited
+        for; else by `connect`. discovery: how link and node find each other,
+        `without_shared_memory` where the node is killed."""
         self.case, self._lossless, self._discovery = case, lossless, discovery
         self._stack = contextlib.ExitStack()
         try:
             self._start([*arguments])
+            if connected:
+                self.connect()
         except BaseException:
             self._stack.close()
             raise
 
-    def _start(self, arguments: list[str]) -> None:
+    def _start(self, arguments):
         case, enter = self.case, self._stack.enter_context
         if self._lossless:
             arguments += ['-p', 'max_wait:=0.0']
@@ -166,25 +160,28 @@ class Rig:
         )
         self.publishers: dict[str, Any] = {}
         self._advertise()
+
+    def connect(self):
+        """Wait until the node hears."""
         self.lockstep.connect(self.publishers.values(), START_LIMIT)
 
-    def __enter__(self) -> Rig:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._stack.close()
 
-    def wait_for(self, predicate: Callable[[], Any]) -> bool:
+    def wait_for(self, predicate):
         """Serve the link until `predicate` holds; False when it never does."""
         return self.lockstep.wait_for(predicate, _PATIENCE)
 
     # -- what a fault may do ---------------------------------------------------------------------
 
-    def send(self, message: Message) -> None:
+    def send(self, message):
         """Send one message, and wait for its answer."""
         self.lockstep.step(self.publishers[message.topic], message.content)
 
-    def send_at_once(self, messages: Iterable[Message]) -> None:
+    def send_at_once(self, messages):
         """Send messages without waiting, and then wait for all answers."""
         sent = time.monotonic()
         messages = list(messages)
@@ -192,40 +189,40 @@ class Rig:
             self.publishers[message.topic].publish(message.content)
         self.lockstep.follow(len(messages), 'all', sent)
 
-    def new_publishers(self) -> None:
+    def new_publishers(self):
         """Other publishers instead of those so far, as of a driver that was started anew."""
         for publisher in self.publishers.values():
             self.link.node.destroy_publisher(publisher)
         self._advertise()
 
-    def peer(self, topic: str, qos: QoSProfile) -> Any:
+    def peer(self, topic, qos):
         """One more publisher on an input."""
         return self.link.node.create_publisher(self._classes[topic], f'/{topic}', qos)
 
-    def reset(self) -> None:
+    def reset(self):
         assert self.call(Trigger, 'reset', Trigger.Request()).success
 
-    def enable(self, on: bool) -> None:
+    def enable(self, on):
         assert self.call(SetBool, 'enable', SetBool.Request(data=on)).success
 
-    def tell_clock(self, stamp_ns: int) -> None:
+    def tell_clock(self, stamp_ns):
         """Publish on /clock."""
         seconds, nanoseconds = divmod(stamp_ns, SECOND)
         self.clock.publish(
             Clock(clock=make('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds))
         )
 
-    def wait_for_clock(self, stamp_ns: int, *, back: bool) -> None:
+    def wait_for_clock(self, stamp_ns, *, back):
         """Publish on /clock until the node lives at that time; back: until it said so."""
         logged = self.node.log().count('/clock is back')
 
-        def there() -> bool:
+        def there():
             self.tell_clock(stamp_ns)
             return not back or self.node.log().count('/clock is back') > logged
 
         assert self.wait_for(there)
 
-    def set_parameters(self, atomically: bool = False, **values: Any) -> list[Any]:
+    def set_parameters(self, atomically=False, **values):
         """Set parameters from outside; gives a result each, or one when `atomically`."""
         parameters = [
             Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
@@ -237,13 +234,13 @@ class Rig:
         request = SetParameters.Request(parameters=parameters)
         return list(self.call(SetParameters, 'set_parameters', request).results)
 
-    def parameters(self, *names: str) -> list[Any]:
+    def parameters(self, *names):
         """The values of parameters."""
         request = GetParameters.Request(names=list(names))
         answer = self.call(GetParameters, 'get_parameters', request)
         return [parameter_value_to_python(value) for value in answer.values]
 
-    def call(self, service: Any, name: str, request: Any) -> Any:
+    def call(self, service, name, request):
         """Call a service of the node."""
         client = self.link.node.create_client(service, f'/{self.case.system}/{name}')
         try:
@@ -254,18 +251,18 @@ class Rig:
         finally:
             self.link.node.destroy_client(client)
 
-    def fresh_diagnostics(self) -> None:
+    def fresh_diagnostics(self):
         """Wait for a report of what is so now."""
         now_ns = time.time_ns()
         assert self.wait_for(lambda: self.diagnostics.newest_ns > now_ns)
 
-    def warned_of(self, words: str) -> None:
+    def warned_of(self, words):
         """Wait until /diagnostics says `words`."""
         assert self.wait_for(lambda: words in ' '.join(self.diagnostics.words))
 
     # -- a whole run -----------------------------------------------------------------------------
 
-    def play(self, steps: Sequence[Step], reports: int = 0) -> list[Estimate]:
+    def play(self, steps, reports=0):
         """Send messages and do actions; gives the estimates that were published meanwhile.
 
         reports: how many of /diagnostics are waited for on the way: a level rises when a finding
@@ -282,12 +279,12 @@ class Rig:
                 self.fresh_diagnostics()
         return self.recorder.estimates(start)
 
-    def undisturbed(self) -> dict[int, Estimate]:
+    def undisturbed(self):
         """What a fresh node makes of the recording: the first word for each stamp."""
         self.reset()
         return first_words(self.play(self.case.messages()))
 
-    def suffer(self, disturb: Callable[..., Any], expected: dict[int, Estimate]) -> Outcome:
+    def suffer(self, disturb, expected):
         """Let a fault happen to the node, and see how long it is felt. expected: `undisturbed`."""
         self.reset()
         self.enable(True)
@@ -322,7 +319,7 @@ class Rig:
             answered=self.lockstep.counts.messages > messages,
         )
 
-    def _advertise(self) -> None:
+    def _advertise(self):
         self.publishers = {topic: self.peer(topic, lockstep_qos()) for topic in self._classes}
         if self.lockstep.counts.messages:
             stamps = self.wait_for(
@@ -331,15 +328,15 @@ class Rig:
             assert stamps
 
 
-def first_words(estimates: Iterable[Estimate]) -> dict[int, Estimate]:
+def first_words(estimates):
     """What was published first for each stamp: what somebody at sea acts upon."""
-    found: dict[int, Estimate] = {}
+    found = {}
     for estimate in estimates:
         found.setdefault(estimate.stamp_ns, estimate)
     return found
 
 
-def _until_held(held: list[bool]) -> int | None:
+def _until_held(held):
     """How many messages until all later ones are good; None when the last one is not."""
     if not held or not held[-1]:
         return None
@@ -357,7 +354,7 @@ SLOW = ('vertical_offset',)
 """States that take a whole approach to learn: as sure as before is not asked of them."""
 
 
-def agrees(found: Estimate, expected: Estimate) -> bool:
+def agrees(found, expected):
     """Whether nearly every row of each has its like in the other: inside of what both say of their
     errors, and what is found is as sure of itself as what was expected, or nearly so. Rows that
     nobody would use yet, as tentative tracks, do not count."""
@@ -368,7 +365,7 @@ def agrees(found: Estimate, expected: Estimate) -> bool:
     return bool(near.any(axis=1).mean() >= SHARE and near.any(axis=0).mean() >= SHARE)
 
 
-def _near(a: Estimate, b: Estimate) -> np.ndarray:
+def _near(a, b):
     """(rows of a, rows of b): which rows agree."""
     apart = a.state[:, None] - b.state[None]
     covariance = a.covariance[:, None] + b.covariance[None]
@@ -378,13 +375,13 @@ def _near(a: Estimate, b: Estimate) -> np.ndarray:
     spread_a, spread_b = (np.diagonal(item.covariance, axis1=1, axis2=2) for item in (a, b))
     quick = [k for k, name in enumerate(a.state_names) if name not in SLOW]
     sure = (spread_a[:, None] <= WIDER**2 * spread_b[None] + 1e-12)[..., quick].all(axis=2)
-    near: np.ndarray = inside & sure
+    near = inside & sure
     if 'range' in a.extras:  # a bin of a swath is itself, whichever other one is like it
         near &= a.extras['range'][:, None] == b.extras['range'][None]
     return near
 
 
-def _certain(estimate: Estimate) -> Estimate:
+def _certain(estimate):
     """The rows that somebody would use."""
     extras, keep = estimate.extras, np.ones(len(estimate), bool)
     if 'track_state' in extras:
@@ -394,11 +391,26 @@ def _certain(estimate: Estimate) -> Estimate:
     if 'valid' in extras:
         keep &= extras['valid'] > 0
     return Estimate(
-        stamp_ns=estimate.stamp_ns,
-        frame_id=estimate.frame_id,
-        xyz=estimate.xyz[keep],
-        state_names=estimate.state_names,
-        state=estimate.state[keep],
+        stamp_ns=estimate.stamp_ns, frame_id=estimate.frame_id, xyz=estimate.xyz[keep],
+        state_names=estimate.state_names, state=estimate.state[keep],
         covariance=estimate.covariance[keep],
         extras={name: column[keep] for name, column in extras.items()},
-    )
+    )  # fmt: skip
+
+
+# -- processes of nodes without a rig --
+
+
+def wait_until_ready(nodes, limit=300.0):
+    """Wait until each NodeProcess says that it hears its inputs; seconds."""
+    end = time.monotonic() + limit
+    while not all('ready, hears' in node.log() for node in nodes):
+        assert all(node.process.poll() is None for node in nodes)
+        assert time.monotonic() < end, [node.log() for node in nodes]
+        time.sleep(0.02)
+
+
+def own_words(log):
+    """What a node wrote itself: Fast DDS also tells, in red, of shared memory that processes of
+    other ROS domains on this machine reach for in the same moment, and goes on without it."""
+    return '\n'.join(line for line in log.splitlines() if 'RTPS_TRANSPORT_SHM' not in line)

@@ -8,11 +8,8 @@
 
 """The faults that every node is tried with, and what is promised of each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 import functools
-from typing import Any
 
 from attrs import frozen
 import numpy as np
@@ -27,11 +24,11 @@ Parts = tuple[list[Step], list[Step]]
 Disturbance = Callable[[list[Message], list[Message], list[Message]], Parts]
 
 
-def middle(change: Callable[..., list[Step]]) -> Callable[..., Disturbance]:
+def middle(change):
     """Make a disturbance of a function of the messages during it; what it was given else stays."""
 
-    def disturbance(*arguments: Any) -> Disturbance:
-        def disturb(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
+    def disturbance(*arguments):
+        def disturb(before, during, after):
             return [*before, *change(during, *arguments)], list(after)
 
         return disturb
@@ -43,28 +40,28 @@ def middle(change: Callable[..., list[Step]]) -> Callable[..., Disturbance]:
 
 
 @middle
-def each(during: list[Message], change: Callable[[Message], Message]) -> list[Step]:
+def each(during, change):
     """Every message on the primary input changed."""
     return [change(step) if step.primary else step for step in during]
 
 
 @middle
-def dropped(during: list[Message], topic: str) -> list[Step]:
+def dropped(during, topic):
     """An input that is silent for a while."""
     return [step for step in during if step.topic != topic]
 
 
 @middle
-def twice(during: list[Message]) -> list[Step]:
+def twice(during):
     """Every message comes two times."""
     return [step for step in during for _ in range(2)]
 
 
 @middle
-def late(during: list[Message], places: int = 3) -> list[Step]:
+def late(during, places=3):
     """Every fourth message on the primary input comes `places` of them later."""
-    held: list[tuple[int, Message]] = []
-    sent: list[Step] = []
+    held = []
+    sent = []
     count = 0
     for step in during:
         count += step.primary
@@ -78,10 +75,10 @@ def late(during: list[Message], places: int = 3) -> list[Step]:
 
 
 @middle
-def shuffled(during: list[Message], size: int = 4) -> list[Step]:
+def shuffled(during, size=4):
     """Messages in any order inside of blocks with `size` of the primary input each."""
     rng = np.random.default_rng(5)
-    blocks: list[list[Message]] = [[]]
+    blocks = [[]]
     for step in during:
         if sum(message.primary for message in blocks[-1]) == size:
             blocks.append([])
@@ -89,36 +86,36 @@ def shuffled(during: list[Message], size: int = 4) -> list[Step]:
     return [block[k] for block in blocks for k in rng.permutation(len(block))]
 
 
-def clock_set(seconds: float) -> Disturbance:
+def clock_set(seconds):
     """The clock of the sensors is set anew after the first third."""
 
-    def disturb(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
+    def disturb(before, during, after):
         return list(before), [step.moved(seconds) for step in [*during, *after]]
 
     return disturb
 
 
-def looped(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
+def looped(before, during, after):
     """The recording is played again from its beginning."""
     whole = [*before, *during, *after]
     return list(whole), list(whole)
 
 
 @middle
-def second_publisher(during: list[Message], seconds: float) -> list[Step]:
+def second_publisher(during, seconds):
     """Every message comes again from a sender whose clock is late."""
     return [step for item in during for step in (item, item.moved(-seconds))]
 
 
-def frame(name: str) -> Callable[[Message], Message]:
+def frame(name):
     """Another frame_id."""
     return lambda item: item.changed(lambda content: setattr(content.header, 'frame_id', name))
 
 
-def columns(**factors: float) -> Callable[[Message], Message]:
+def columns(**factors):
     """Columns of a table in another unit."""
 
-    def change(content: Any) -> None:
+    def change(content):
         table = dict(decode_table(content))
         for name, factor in factors.items():
             table[name] = (table[name] * factor).astype(table[name].dtype)
@@ -135,39 +132,35 @@ def columns(**factors: float) -> Callable[[Message], Message]:
 
 
 @middle
-def burst(during: list[Message]) -> list[Step]:
+def burst(during):
     """All messages at once, as after a stall of the network."""
     return [Action(lambda rig: rig.send_at_once(during))]
 
 
 @middle
-def sensor_restarted(during: list[Message]) -> list[Step]:
+def sensor_restarted(during):
     """A driver ends, and another process of it begins after a while."""
     third = len(during) // 3
     return [*during[:third], Action(lambda rig: rig.new_publishers()), *during[2 * third :]]
 
 
 @middle
-def node_reset(during: list[Message]) -> list[Step]:
+def node_reset(during):
     """The service ~/reset in the middle of the stream."""
     return [*during[:-1], Action(lambda rig: rig.reset()), during[-1]]
 
 
 @middle
-def disabled(during: list[Message]) -> list[Step]:
+def disabled(during):
     """Input is not used for a while: ~/enable with false, then with true."""
-    return [
-        Action(lambda rig: rig.enable(False)),
-        *during,
-        Action(lambda rig: rig.enable(True)),
-    ]
+    return [Action(lambda rig: rig.enable(False)), *during, Action(lambda rig: rig.enable(True))]
 
 
 @middle
-def parameter_storm(during: list[Message]) -> list[Step]:
+def parameter_storm(during):
     """Good, bad and mixed changes of parameters between all messages."""
 
-    def storm(rig: Any) -> None:
+    def storm(rig):
         before = rig.parameters('stale_after', 'max_wait')
         good, bad = rig.set_parameters(stale_after=before[0] + 1.0, max_wait=-1.0)
         assert good.successful and not bad.successful and 'max_wait' in bad.reason
@@ -186,10 +179,10 @@ def parameter_storm(during: list[Message]) -> list[Step]:
 
 
 @middle
-def unheard_publisher(during: list[Message], qos: QoSProfile) -> list[Step]:
+def unheard_publisher(during, qos):
     """One more publisher on the input, whose quality of service does not fit."""
 
-    def publish(rig: Any) -> None:
+    def publish(rig):
         peer = rig.peer(rig.case.primary, qos)
         try:
             for step in during:
@@ -202,13 +195,13 @@ def unheard_publisher(during: list[Message], qos: QoSProfile) -> list[Step]:
     return [Action(publish), *during]
 
 
-def simulated_clock(seconds: float) -> Disturbance:
+def simulated_clock(seconds):
     """/clock follows the stamps, and jumps with them after the first third."""
 
-    def split(message: Message) -> list[Step]:
+    def split(message):
         return [Action(lambda rig: rig.tell_clock(message.stamp_ns)), message]
 
-    def disturb(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
+    def disturb(before, during, after):
         rest = [step.moved(seconds) for step in [*during, *after]]
         first = Action(lambda rig: rig.wait_for_clock(rest[0].stamp_ns, back=seconds < 0.0))
         return (
@@ -220,7 +213,7 @@ def simulated_clock(seconds: float) -> Disturbance:
 
 
 @middle
-def long_enough(during: list[Message]) -> list[Step]:
+def long_enough(during):
     """Nothing but time, until the node says that it cannot save its state."""
     return [*during, Action(lambda rig: rig.warned_of('the state cannot be saved'))]
 
@@ -259,7 +252,7 @@ SIMULATED = ('-p', 'use_sim_time:=true')
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def in_another_unit(name: str, systems: Sequence[str], **factors: float) -> Fault:
+def in_another_unit(name, systems, **factors):
     """Columns in a unit that no reader takes."""
     refused = ['refused: out_of_range']
     return Fault(

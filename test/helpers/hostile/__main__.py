@@ -48,12 +48,10 @@ def messages(system, cases, first_seed=0):
 
         @seed(number)
         @settings(
-            max_examples=min(MOST_EXAMPLES, -(-(cases - tally.cases) // BATCH)),
-            deadline=None,
-            database=None,
-            phases=[Phase.generate, Phase.shrink],
+            max_examples=min(MOST_EXAMPLES, -(-(cases - tally.cases) // BATCH)), deadline=None,
+            database=None, phases=[Phase.generate, Phase.shrink],
             suppress_health_check=list(HealthCheck),
-        )
+        )  # fmt: skip
         @given(batch=batches(system))
         def search(batch):
             run(system, batch, tally)
@@ -69,18 +67,13 @@ def messages(system, cases, first_seed=0):
         grown = grown or peak
     slow = np.sort(tally.seconds)
     return {
-        'cases': tally.cases,
-        'read': tally.read,
-        'refused': dict(tally.refused.most_common()),
-        'refused_by_the_tracker': dict(tally.counted.most_common()),
-        'estimates': tally.estimates,
-        'failures': failures,
-        'ms_median': round(1e3 * float(np.median(slow)), 3),
+        'cases': tally.cases, 'read': tally.read, 'refused': dict(tally.refused.most_common()),
+        'refused_by_the_tracker': dict(tally.counted.most_common()), 'estimates': tally.estimates,
+        'failures': failures, 'ms_median': round(1e3 * float(np.median(slow)), 3),
         'ms_p999': round(1e3 * float(slow[int(0.999 * len(slow))]), 1),
-        'ms_most': round(1e3 * float(slow[-1]), 1),
-        'memory_grown_mb': round(peak - grown, 1),
+        'ms_most': round(1e3 * float(slow[-1]), 1), 'memory_grown_mb': round(peak - grown, 1),
         'cpu_seconds': round(process_time() - start, 1),
-    }
+    }  # fmt: skip
 
 
 def parameters(system, draws):
@@ -95,12 +88,9 @@ def parameters(system, draws):
         ran += found is not None
         estimates += found or 0
     return {
-        'draws': draws,
-        'ran': ran,
-        'estimates': estimates,
-        'failures': failures,
+        'draws': draws, 'ran': ran, 'estimates': estimates, 'failures': failures,
         'cpu_seconds': round(process_time() - start, 1),
-    }
+    }  # fmt: skip
 
 
 def _text_of(error):

@@ -170,10 +170,8 @@ def state_results(recording, draws, first):
 
 
 def _results(name, draws, start, used, failures):
+    seconds = round(process_time() - start, 1)
     return {
-        'name': name,
-        'draws': draws,
-        'used': used,
-        'failures': failures[:5],
-        'cpu_seconds': round(process_time() - start, 1),
-    }
+        'name': name, 'draws': draws, 'used': used, 'failures': failures[:5],
+        'cpu_seconds': seconds,
+    }  # fmt: skip

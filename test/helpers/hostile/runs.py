@@ -35,9 +35,7 @@ from .streams import IMAGES, stream, templates, VARIANTS
 BATCH = 50
 """Bad messages in one run of a tracker."""
 
-REFUSALS = {
-    'too_late', 'duplicate', 'other_frame', 'unknown_type', 'other_spacing', 'full',
-}  # fmt: skip
+REFUSALS = {'too_late', 'duplicate', 'other_frame', 'unknown_type', 'other_spacing', 'full'}
 """What trackers count of a measurement that changes nothing; ``doubted`` is counted of earlier
 ones when one is believed."""
 

@@ -17,21 +17,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from msg_adapters.inputs import inputs_of, made_inputs
-from sonar_imm.measurements import (
-    Altitude,
-    ArrayDepth,
-    Arrivals,
-    CrossSpectra,
-    Detections,
-    Fix,
-    Fixes,
-    GeodeticFix,
-    Ground,
-    Navigation,
-    Pressure,
-    Snapshot,
-    Trace,
-)
+from sonar_imm import measurements as m
 
 from .schema import blank, clone, is_many, leaves, make, number_type
 
@@ -43,36 +29,23 @@ VARIANTS = {
     'bathymetry': (
         {'model_set': 'height_two_rw', 'particles_per_model': 8, 'smoothing': 'none'},
         {'model_set': 'height_rw_ncs', 'particles_per_model': 8, 'smoothing': 'modes'},
-        {
-            'navigation': 'ignored',
-            'ping_coupling': 0.3,
-        },
+        {'navigation': 'ignored', 'ping_coupling': 0.3},
     ),
     'diver': (
         {'max_tracks': 4},
-        {
-            'origin': [3.0, 3.0, 0.0], 'fix_bias_std': 0.5, 'tags': ['a'], 'max_tracks': 4,
-        },
+        {'origin': [3.0, 3.0, 0.0], 'fix_bias_std': 0.5, 'tags': ['a'], 'max_tracks': 4},
         {'dimensions': 3, 'association': 'jipda', 'max_tracks': 4},
         {'association': 'jipda', 'model_set': 'heading_speed', 'tags': ['a'], 'max_tracks': 4},
     ),
     'fathometer': (
         {'particles': 40, 'order_max': 3, 'phones': 0, 'record_seconds': 0.2},
-        {
-            'particles': 40, 'order_max': 2, 'phones': 0, 'smoothing_lag': 1, 'heave': 'memory',
-            'record_distance': 5.0,
-        },
-        {
-            'particles': 40, 'order_max': 2, 'phones': 4, 'polarity': 'both',
-        },
+        {'particles': 40, 'order_max': 2, 'phones': 0, 'smoothing_lag': 1, 'heave': 'memory',
+         'record_distance': 5.0},
+        {'particles': 40, 'order_max': 2, 'phones': 4, 'polarity': 'both'},
     ),
     'obstacle': (
         {'max_tracks': 6, 'history': 1.0},
-        {
-            'ping_timing': 'two_way',
-            'max_tracks': 4,
-            'history': 1.0,
-        },
+        {'ping_timing': 'two_way', 'max_tracks': 4, 'history': 1.0},
         {'behaviours': ['fixed'], 'max_tracks': 4},
     ),
 }  # fmt: skip
@@ -94,44 +67,39 @@ def _diver(k):
         rx = np.array([[0.0, 0, 0], [70, 10, 0], [-60, 45, 0], [10, 85, 0]])
         leg = np.linalg.norm(rx - at, axis=1)
         none = np.full(4, np.nan)
-        yield 'arrivals', Arrivals(
+        yield 'arrivals', m.Arrivals(
             stamp_ns=stamp, frame_id='map', tx_id=np.zeros(4), rx_id=np.arange(4),
             tx=np.tile(rx[0], (4, 1)), rx=rx, toa=(leg + leg[0]) / 1500.0,
             var_toa=np.full(4, 1e-8), bearing=none, var_bearing=none,
         )  # fmt: skip
     elif k % 4 == 1:
         both = np.array([at, at + [20.0, 9.0, 0.0]])
-        covariance = np.tile(COVARIANCE, (2, 1, 1))
-        yield 'fixes', Fixes(stamp_ns=stamp, frame_id='map', position=both, covariance=covariance)
+        scan = {'position': both, 'covariance': np.tile(COVARIANCE, (2, 1, 1))}
+        yield 'fixes', m.Fixes(stamp_ns=stamp, frame_id='map', **scan)
     else:
-        yield 'fix', Fix(stamp_ns=stamp, frame_id='map', position=at, covariance=COVARIANCE)
+        yield 'fix', m.Fix(stamp_ns=stamp, frame_id='map', position=at, covariance=COVARIANCE)
 
 
 def _pose(k, step_ns):
     yaw = 0.05 * math.sin(k)
-    return Navigation(
-        stamp_ns=T0 + k * step_ns,
-        position=[0.5 * k, 0.0, -5.0],
+    return m.Navigation(
+        stamp_ns=T0 + k * step_ns, position=[0.5 * k, 0.0, -5.0], velocity=[1.0, 0.0, 0.0],
         orientation=[0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)],
-        velocity=[1.0, 0.0, 0.0],
-        frame_id='map',
-        child_frame_id='base',
-    )
+        frame_id='map', child_frame_id='base',
+    )  # fmt: skip
 
 
 def _obstacle(k):
     step = SECOND // 2
     yield 'nav', _pose(k, step)
     if k % 4 == 0:
-        yield 'altitude', Altitude(stamp_ns=T0 + k * step, altitude=12.0, frame_id='altimeter')
+        yield 'altitude', m.Altitude(stamp_ns=T0 + k * step, altitude=12.0, frame_id='altimeter')
     if k % 4 == 2:
         floor = np.array([[30.0, 0.0, -17.0], [31.0, 1.0, -17.1]]) + [0.5 * k, 0.0, 0.0]
-        yield (
-            'ground',
-            Ground(stamp_ns=T0 + k * step, frame_id='map', position=floor, variance=[0.01, 0.01]),
-        )
+        ground = {'frame_id': 'map', 'position': floor, 'variance': [0.01, 0.01]}
+        yield 'ground', m.Ground(stamp_ns=T0 + k * step, **ground)
     ranges = np.array([40.0, 25.0]) - 0.5 * k
-    yield 'detections', Detections(
+    yield 'detections', m.Detections(
         stamp_ns=T0 + k * step, frame_id='sonar', range=ranges, bearing=[0.05, -0.1],
         var_range=[0.04, 0.04], var_bearing=[1e-4, 1e-4], intensity=[10.0, 20.0],
         elevation=[0.05, np.nan], var_elevation=[3e-4, np.nan],
@@ -147,7 +115,7 @@ def _noise(*shape):
 def _csdm(stamp):
     y = _noise(16, 4, 6)
     csdm = np.einsum('fms,fns->fmn', y, y.conj()) / 6.0
-    return CrossSpectra(
+    return m.CrossSpectra(
         stamp_ns=stamp, frequency=500.0 + 50.0 * np.arange(16), csdm=csdm, snapshots=6,
         frame_id='array', reference_depth=30.0,
     )  # fmt: skip
@@ -155,7 +123,7 @@ def _csdm(stamp):
 
 def _pressure(k, stamp):
     samples = _noise(STEPS * 600, 4).real[600 * k : 600 * (k + 1)].astype(np.float32)
-    return Pressure(
+    return m.Pressure(
         stamp_ns=stamp, pressure=samples, sample_rate=6000.0, frame_id='array', scale=0.0,
         reference_depth=30.0,
     )  # fmt: skip
@@ -164,7 +132,7 @@ def _pressure(k, stamp):
 def _trace(stamp):
     depth = 20.0 + 0.1 * np.arange(60)
     amplitude = np.exp(-np.square((depth - 22.0) / 0.3)) + 0.02 * np.sin(31.0 * depth)
-    return Trace(
+    return m.Trace(
         stamp_ns=stamp, depth=depth, amplitude=amplitude, sigma=np.full(60, 0.1), frame_id='array'
     )
 
@@ -172,8 +140,8 @@ def _trace(stamp):
 def _fathometer(k, variant):
     stamp = T0 + k * (SECOND // 10 if variant == 0 else SECOND)
     if k % 5 == 0:
-        yield 'array_depth', ArrayDepth(stamp_ns=stamp, depth=30.0)
-        yield 'position', GeodeticFix(stamp_ns=stamp, latitude=3.0, longitude=3.0 + 1e-4 * k)
+        yield 'array_depth', m.ArrayDepth(stamp_ns=stamp, depth=30.0)
+        yield 'position', m.GeodeticFix(stamp_ns=stamp, latitude=3.0, longitude=3.0 + 1e-4 * k)
     if variant == 0:
         yield 'pressure', _pressure(k, stamp)
     elif variant == 1:
@@ -188,8 +156,8 @@ def _bathymetry(k):
     iq = (_noise(STEPS * 16, 1) * np.exp(1j * np.arange(4)) * 5.0)[16 * k : 16 * (k + 1)]
     yield 'nav', _pose(k, SECOND // 5)
     if k % 4 == 0:
-        yield 'altitude', Altitude(stamp_ns=stamp, altitude=15.0, frame_id='altimeter')
-    yield 'snapshot', Snapshot(
+        yield 'altitude', m.Altitude(stamp_ns=stamp, altitude=15.0, frame_id='altimeter')
+    yield 'snapshot', m.Snapshot(
         stamp_ns=stamp, range=ranges, iq=iq.astype(np.complex64), frame_id='sonar',
         noise_variance=np.ones(16), sound_speed=1500.0,
     )  # fmt: skip
@@ -252,19 +220,11 @@ SPECIAL = {
         'intensities': np.arange(4, dtype='u1'),
     },
     'seatrac_interfaces/msg/ModemRec': {'position_flt_error': False, 'msg_id': 0x10},
-    'sensors/msg/SonoptixECHO': {
-        'array_data': make(
-            'std_msgs/msg/Float32MultiArray',
-            data=np.arange(16, dtype='f4'),
-            layout=make(
-                'std_msgs/msg/MultiArrayLayout',
-                dim=[
-                    make('std_msgs/msg/MultiArrayDimension', label=name, size=4, stride=4)
-                    for name in ('ranges', 'beams')
-                ],
-            ),
-        )
-    },
+    'sensors/msg/SonoptixECHO': {'array_data': make(
+        'std_msgs/msg/Float32MultiArray', data=np.arange(16, dtype='f4'), layout=make(
+            'std_msgs/msg/MultiArrayLayout', dim=[
+                make('std_msgs/msg/MultiArrayDimension', label=name, size=4, stride=4)
+                for name in ('ranges', 'beams')]))},
 }  # fmt: skip
 """Fields that a type needs beside plausible numbers."""
 

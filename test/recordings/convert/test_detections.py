@@ -8,8 +8,7 @@
 
 """Receivers with clocks of their own, compared by tags that lie at known places."""
 
-from helpers.case_files import text_of
-from helpers.field_files import measured
+from helpers.field_files import measured, text_of
 import numpy as np
 import pytest
 from scipy.optimize import least_squares

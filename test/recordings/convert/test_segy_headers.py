@@ -13,7 +13,7 @@ import struct
 import sys
 
 from helpers.field_files import measured
-from helpers.segy_files import write_segy
+from helpers.sonar_files import write_segy
 import numpy as np
 import pytest
 import yaml

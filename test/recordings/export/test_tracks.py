@@ -16,7 +16,7 @@ import struct
 from xml.etree import ElementTree
 
 from helpers.dive_bags import write_dive
-from helpers.segy_files import write_segy
+from helpers.sonar_files import write_segy
 import numpy as np
 import pymap3d
 import pytest

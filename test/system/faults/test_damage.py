@@ -94,7 +94,6 @@ def limited(size, *words):
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)),
         capture_output=True,
         text=True,
-        timeout=120,
     )
 
 

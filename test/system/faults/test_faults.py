@@ -64,14 +64,11 @@ def test_a_fault_is_survived_counted_and_said(fault, system, rigs, figures):
     outcome = rig.suffer(fault.disturb, expected)
     limit = CASES[system].settle if fault.settle is None else fault.settle
     figures.add(
-        {'fault': fault.name, 'system': system},
-        recovered=outcome.recovered,
-        limit=limit,
-        estimates=outcome.estimates,
-        losses=outcome.losses,
+        {'fault': fault.name, 'system': system}, recovered=outcome.recovered, limit=limit,
+        estimates=outcome.estimates, losses=outcome.losses,
         worst=LEVELS[max(map(LEVELS.index, outcome.levels))],
         traceback='Traceback' in outcome.words,
-    )
+    )  # fmt: skip
     assert 'Traceback' not in outcome.words
     assert outcome.answered
     assert outcome.recovered is not None and outcome.recovered <= limit, outcome

@@ -9,15 +9,12 @@
 """Input at ten times what a node can process, at the pace of the clock instead of in lock-step:
 sender and node need a processor each."""
 
-from __future__ import annotations
-
 from collections import Counter
-from collections.abc import Iterator
 import itertools
 import time
 from typing import NamedTuple
 
-from helpers.faults.cases import Case, CASES, Message, SECOND
+from helpers.faults.cases import CASES, SECOND
 from helpers.faults.figures import long_form
 from helpers.faults.rig import Rig
 import numpy as np
@@ -41,9 +38,9 @@ def test_a_flooded_node_answers_soon_counts_what_it_drops_and_recovers(system, f
     assert flood.rate > 5.0 * flood.capacity
     assert flood.sent == flood.used + flood.dropped + flood.lost
     assert flood.dropped + flood.lost > 0.3 * flood.sent and flood.warned
-    patience = max(1.0, 6.0 / flood.capacity)  # a loaded machine is slow with each message
-    assert flood.latency_max < MAX_WAIT + patience
-    assert flood.recovered < patience
+    work = flood.sent / flood.capacity  # half a minute: what all of it would take
+    assert flood.latency_p50 < MAX_WAIT + 0.05 * work  # a loaded machine is slow with each message
+    assert flood.latency_max < 0.3 * work and flood.recovered < 0.3 * work
 
 
 _USUAL = 20
@@ -68,7 +65,7 @@ class Flood(NamedTuple):
     warned: bool
 
 
-def flooded(case: Case, max_wait: float, *, times: float, seconds: float) -> Flood:
+def flooded(case, max_wait, *, times, seconds):
     """Send messages to the node of `case` for a while, `times` as fast as it can process them."""
     with Rig(case, ('-p', f'max_wait:={max_wait}'), lossless=False) as rig:
         rig.play(case.messages())
@@ -109,7 +106,7 @@ class Sent:
     """When messages were sent, and how long it took to hear of each. sent: s of the steady clock,
     latency: s, both by stamp."""
 
-    def __init__(self, rig: Rig):
+    def __init__(self, rig):
         self._rig = rig
         self.sent: dict[int, float] = {}
         self.latency: dict[int, float] = {}
@@ -118,17 +115,17 @@ class Sent:
         rig.wait_for(lambda: rig.link.node.count_subscribers(topic) > 1)
         rig.diagnostics.forget()
 
-    def send(self, item: Message) -> None:
+    def send(self, item):
         self.sent[item.stamp_ns] = time.monotonic()
         self._rig.publishers[item.topic].publish(item.content)
 
-    def soon(self, item: Message, limit: float) -> bool:
+    def soon(self, item, limit):
         """Whether the answer to a message comes within `limit`; waits for that time at least."""
         self.send(item)
         self._rig.link.wait_for(lambda: item.stamp_ns in self.latency, limit)
         return item.stamp_ns in self.latency
 
-    def counts(self) -> Counter[str]:
+    def counts(self):
         """Messages on the primary input so far: received, and of these dropped; lost."""
         self._rig.fresh_diagnostics()
         given, topic = self._rig.diagnostics.counts(), self._rig.case.primary
@@ -138,14 +135,14 @@ class Sent:
             lost=given[f'lost on {topic}'] + given[f'lost on /{topic}'],
         )
 
-    def _answered(self, message: PointCloud2) -> None:
+    def _answered(self, message):
         stamp = message.header.stamp
         stamp_ns = stamp.sec * SECOND + stamp.nanosec
         if stamp_ns in self.sent:
             self.latency.setdefault(stamp_ns, time.monotonic() - self.sent[stamp_ns])
 
 
-def endless(case: Case) -> Iterator[Message]:
+def endless(case):
     """The messages of a case again and again after they were sent once, their stamps moved on."""
     messages = case.messages()
     length = (messages[-1].stamp_ns - messages[0].stamp_ns) / SECOND + case.period

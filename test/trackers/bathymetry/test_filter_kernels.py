@@ -8,9 +8,9 @@
 
 """The particle filter of a ping: bits of its verbs in numpy, which meet closed forms."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
+from helpers.vector_files import load_vectors
 import numpy as np
 from oracles import bin_likelihood
 from oracles import imm_particles as oracle
@@ -23,7 +23,6 @@ from sonar_imm.trackers.bathymetry import bins, ping
 from sonar_imm.trackers.bathymetry.filter_kernels import normals
 from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 
-VECTORS = Path(__file__).parents[2] / 'vectors' / 'bathymetry'
 ASYMMETRIC = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
 M, N, P = 3, 50, 5
 
@@ -215,8 +214,7 @@ def test_phasors_are_cosines_and_sines():
 
 def test_all_sequences_of_models_are_summed_over():
     """Runs of the filter on a linear Gaussian system: the exact answer is over 2^12 of them."""
-    with np.load(VECTORS / 'jmls_enum.npz') as archive:
-        case = dict(archive)
+    case = load_vectors('bathymetry/jmls_enum')
     width, N, runs = float(case['dS']), 10_000, 16
     F = np.array([[[1.0, 0.0], [0.0, 0.0]], [[1.0, width], [0.0, 1.0]]])
     G = np.array([[[1.0, 0.0], [0.0, 0.0]], [[width**2 / 2, 0.0], [width, 0.0]]])

@@ -12,8 +12,9 @@ import itertools
 import math
 
 from attrs import evolve
-from helpers.bathymetry_cases import EXACT, floor, VECTORS
+from helpers.bathymetry_cases import EXACT, floor
 from helpers.estimates import same
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
@@ -52,8 +53,7 @@ def test_smooth_is_said_only_where_rough_would_be_seen():
 
 
 def test_the_error_of_one_snapshot_is_that_of_the_reference_ping():
-    with np.load(VECTORS.parent / 'layover' / 'labels.npz') as archive:
-        case = dict(archive)
+    case = load_vectors('layover/labels')
     y = case['iq'].astype(np.float64)
     r = case['r']
     decibels = 30.0 - 20.0 * np.log(r / 17.0) / np.log(77.0 / 17.0)

@@ -9,7 +9,14 @@
 """The tracker on a ship that moves: the vectors of motion, gaps, pings that wait for poses."""
 
 from attrs import evolve
-from helpers.sea import motion_case, navigation, sea_config, snapshots, START_NS, swath_of
+from helpers.bathymetry_cases import (
+    motion_case,
+    navigation,
+    sea_config,
+    snapshots,
+    START_NS,
+    swath_of,
+)
 import numpy as np
 from oracles.bin_likelihood import drift, sines_of
 import pytest

@@ -161,11 +161,8 @@ def test_a_sign_that_is_told_right_stays():
         _, tracker, _ = tracked(pings(conjugate=bool(values), count=1), **values)
         assert not tracker.warnings() and not tracker._signs['starboard'].is_turned
         assert not tracker._signs['starboard'].is_open
-
-
-def test_without_a_tilt_no_floor_tells_the_sign():
-    snapshots = pings(np.conj, count=1, tilt_deg=10.0)
-    _, tracker, _ = tracked(snapshots, tilt_deg=10.0)
+    # Without a tilt no floor tells the sign.
+    _, tracker, _ = tracked(pings(np.conj, count=1, tilt_deg=10.0), tilt_deg=10.0)
     assert tracker._signs == {}
 
 
@@ -451,11 +448,8 @@ def test_so_is_what_the_staves_of_one_card_share():
     ]
     lines, _ = lines_and_health(evolve(clean, iq=np.hstack(cards)), gate_false_alarm=1.0)
     assert len(lines) == 1
-
-
-def test_a_weak_one_under_a_floor_is_not():
-    clean = floor(0.0, snr_db=25.0)
-    lines, health = lines_and_health(shared(clean, 0.0))
+    # A weak one under a floor is not said.
+    lines, health = lines_and_health(shared(floor(0.0, snr_db=25.0), 0.0))
     assert not lines and health['common_mode'] < 0.1
 
 

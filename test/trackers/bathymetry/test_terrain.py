@@ -10,10 +10,10 @@
 on cells of height and slope, and floors whose shape is known."""
 
 import math
-from pathlib import Path
 
 from attrs import evolve
 from helpers.bathymetry_cases import EXACT, floor
+from helpers.vector_files import load_vectors
 import numpy as np
 from oracles.array_likelihood import log_likelihood
 from oracles.terrain import smoothed
@@ -29,7 +29,6 @@ from sonar_imm.trackers.bathymetry.terrain import KINDS, SLOPE0, Terrain, terrai
 from sonar_imm.trackers.bathymetry.terrain_filter import run_terrain
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
-FOLDER = Path(__file__).parents[2] / 'vectors' / 'bathymetry_by_default'
 STEP = 2.0 * math.pi * 0.5
 NINE = KINDS[:9]
 """The models of the vectors; later ones are compared with nothing."""
@@ -37,8 +36,7 @@ TERRAIN = BathymetryConfig(model_set='terrain', layover='ignored', **EXACT)
 
 
 def vectors(name):
-    with np.load(FOLDER / f'{name}.npz', allow_pickle=False) as archive:
-        return dict(archive)
+    return load_vectors(f'bathymetry_by_default/{name}')
 
 
 def samples(values):

@@ -9,10 +9,10 @@
 """Bins with two surfaces: the likelihood, the smoother, what is marked and given."""
 
 import math
-from pathlib import Path
 
 from attrs import evolve
 from helpers.bathymetry_cases import floor
+from helpers.vector_files import load_vectors
 import numpy as np
 from oracles import two_surfaces as oracle
 import pytest
@@ -25,7 +25,6 @@ from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 from sonar_imm.trackers.bathymetry.ping import look, Ping
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
-VECTORS = Path(__file__).parents[2] / 'vectors' / 'layover'
 OF_GATED, NEW = ['existence_2', 'surfaces'], ['height_2', 'height_2_std']
 
 
@@ -113,8 +112,7 @@ def test_the_smoother_is_that_of_one_matrix_over_all_heights_and_pairs():
 def test_existence_and_heights_of_the_prototype(monkeypatch):
     # Its stretches begin where the chain says so, and nowhere else.
     monkeypatch.setattr(two, 'BRIGHTER', 1e9)
-    with np.load(VECTORS / 'pings.npz') as archive:
-        known = dict(archive)
+    known = load_vectors('layover/pings')
     parts = known['iq'].astype(np.float32)
     iq = parts[..., 0] + 1j * parts[..., 1]
     config = BathymetryConfig(layover='resolved', gate_false_alarm=1.0)

@@ -9,10 +9,9 @@
 
 """Fixes that are off for a while, in two groups, or in turns: followed as they are, and said."""
 
-from pathlib import Path
-
 from attrs import evolve
 from helpers.diver_runs import fix, run, scan_of
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
@@ -24,8 +23,6 @@ from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.polling import BEFORE, MOST_FIXES, turn_of
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
-
-VECTORS = Path(__file__).parents[2] / 'vectors/diver_in_the_field'
 
 
 def config(**values):
@@ -53,55 +50,55 @@ def assert_states(models, blocks, x, P, mask, skip=()):
 
 
 def test_an_offset_is_mixed_and_predicted_as_by_the_prototype(models):
-    with np.load(VECTORS / 'offset_mix.npz') as v:
-        speed = {'speed': float(v['speed_mean']), 'speed_variance': float(v['speed_var'])}
-        law = evolve(models.bank, sector=float(v['sigma2']), **speed)
-        blocks = models.to_blocks(v['x'][None], v['P'][None])
-        mixed, c = bank.mix(law, blocks, v['mu'][None], v['transition'][None], bursts.TAIL)
-        np.testing.assert_allclose(c[0], v['mixed_mu'], atol=1e-12)
-        mask = used(v['kind'])
-        assert_states(models, mixed, v['mixed_x'], v['mixed_P'], mask)
-        moved = [bank.predict(block, move) for block, move in zip(mixed, models.moves(1.0))]
-        # Hovers forget their speed, which those of the prototype do not.
-        hovers = np.flatnonzero(v['kind'] == 2)
-        assert_states(models, moved, v['predicted_x'], v['predicted_P'], mask, hovers)
+    v = load_vectors('diver_in_the_field/offset_mix')
+    speed = {'speed': float(v['speed_mean']), 'speed_variance': float(v['speed_var'])}
+    law = evolve(models.bank, sector=float(v['sigma2']), **speed)
+    blocks = models.to_blocks(v['x'][None], v['P'][None])
+    mixed, c = bank.mix(law, blocks, v['mu'][None], v['transition'][None], bursts.TAIL)
+    np.testing.assert_allclose(c[0], v['mixed_mu'], atol=1e-12)
+    mask = used(v['kind'])
+    assert_states(models, mixed, v['mixed_x'], v['mixed_P'], mask)
+    moved = [bank.predict(block, move) for block, move in zip(mixed, models.moves(1.0))]
+    # Hovers forget their speed, which those of the prototype do not.
+    hovers = np.flatnonzero(v['kind'] == 2)
+    assert_states(models, moved, v['predicted_x'], v['predicted_P'], mask, hovers)
 
 
 def test_an_offset_begins_as_in_the_prototype(models):
-    with np.load(VECTORS / 'offset.npz') as v:
-        blocks = models.to_blocks(v['x'][None], v['P'][None])
-        z, R, one = v['z'][None], v['R'][None], np.ones(1)
-        assert (v['P'][:, 4:] == 0.0).all()
+    v = load_vectors('diver_in_the_field/offset')
+    blocks = models.to_blocks(v['x'][None], v['P'][None])
+    z, R, one = v['z'][None], v['R'][None], np.ones(1)
+    assert (v['P'][:, 4:] == 0.0).all()
 
-        def log_density(blocks, factor):
-            found = [
-                bank.compare(*bank.predict_fix(b, p.measured, factor), np.zeros(1, int), z, R)
-                for b, p in zip(blocks, models.parts)
-            ]
-            return found, bank.mixture_log_density(v['mu'][None], found)[0]
+    def log_density(blocks, factor):
+        found = [
+            bank.compare(*bank.predict_fix(b, p.measured, factor), np.zeros(1, int), z, R)
+            for b, p in zip(blocks, models.parts)
+        ]
+        return found, bank.mixture_log_density(v['mu'][None], found)[0]
 
-        _, log = log_density(blocks, np.zeros(1))
-        assert log == pytest.approx(float(v['log_density']), rel=1e-9)
-        wide = bursts._with_prior(blocks, np.array([True]), np.full(1, float(v['variance'])))
-        compared, log = log_density(wide, one)
-        assert log == pytest.approx(float(v['log_density_offset']), rel=1e-9)
-        after, mu = [], []
-        for block, part, pairs in zip(wide, models.parts, compared):
-            ratio = np.exp(pairs.log - log)
-            done = bank.update(
-                block, pairs, np.zeros(1, int), ratio, np.zeros(1), part.measured, None, one
-            )
-            after.append(done[0])
-            mu.append(done[1])
-        assert_states(models, after, v['after_x'], v['after_P'], used(v['kind']))
-        mu = np.concatenate(mu, axis=1)[0] * v['mu']
-        np.testing.assert_allclose(mu / mu.sum(), v['after_mu'], atol=1e-9)
+    _, log = log_density(blocks, np.zeros(1))
+    assert log == pytest.approx(float(v['log_density']), rel=1e-9)
+    wide = bursts._with_prior(blocks, np.array([True]), np.full(1, float(v['variance'])))
+    compared, log = log_density(wide, one)
+    assert log == pytest.approx(float(v['log_density_offset']), rel=1e-9)
+    after, mu = [], []
+    for block, part, pairs in zip(wide, models.parts, compared):
+        ratio = np.exp(pairs.log - log)
+        done = bank.update(
+            block, pairs, np.zeros(1, int), ratio, np.zeros(1), part.measured, None, one
+        )
+        after.append(done[0])
+        mu.append(done[1])
+    assert_states(models, after, v['after_x'], v['after_P'], used(v['kind']))
+    mu = np.concatenate(mu, axis=1)[0] * v['mu']
+    np.testing.assert_allclose(mu / mu.sum(), v['after_mu'], atol=1e-9)
 
 
 def test_odds_of_the_two_readings():
-    with np.load(VECTORS / 'jump.npz') as v:
-        odds = bursts.jump_log_odds(*v['counts'].T, 0.05)
-        np.testing.assert_allclose(odds, v['log_odds'], atol=1e-12)
+    v = load_vectors('diver_in_the_field/jump')
+    odds = bursts.jump_log_odds(*v['counts'].T, 0.05)
+    np.testing.assert_allclose(odds, v['log_odds'], atol=1e-12)
     # An established track resists 135 fixes to even odds, 224 until it moves.
     n = np.arange(1, 400)
     odds = bursts.jump_log_odds(np.full(399, 500), np.zeros(399), n, 0.05)
@@ -116,8 +113,7 @@ def fixes(t, z, R, **more):
 
 
 def test_two_bursts_are_those_of_the_prototype():
-    with np.load(VECTORS / 'rows.npz') as v:
-        v = dict(v)
+    v = load_vectors('diver_in_the_field/rows')
     tracker = DiverTracker(config(adaptation='fixed'))
     made = [tracker.process(each)[-1] for each in fixes(v['t'], v['z'], v['R'])]
     state = np.array([each.state[0] for each in made])

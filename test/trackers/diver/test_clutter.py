@@ -8,11 +8,10 @@
 
 """The density of false fixes, learnt from scans; where a sensor sees, and who leaves it."""
 
-from pathlib import Path
-
 from attrs import evolve
 from helpers.diver_runs import arrivals, scan, scan_of, SECOND
 from helpers.estimates import same
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -33,8 +32,6 @@ from sonar_imm.trackers.diver.config import CLUTTER
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.trackers.state_file import json_parameters
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
-
-VECTORS = Path(__file__).parents[2] / 'vectors' / 'diver_in_the_field'
 
 
 def scans(count, false, half, seed=11, divers=((0.0, 0.0), (0.0, 2.0)), aspect=1.0):
@@ -155,7 +152,7 @@ def remembered(points, weight, scans, whole):
 
 
 def test_the_density_at_a_fix_is_that_of_an_independent_program():
-    v = np.load(VECTORS / 'density.npz')
+    v = load_vectors('diver_in_the_field/density')
     known = remembered(v['points'], v['weight'], float(v['scans']) - 5.0, float(v['whole']))
     found = known.density_at(v['z'], v['R'])
     assert found == pytest.approx(v['density'], rel=1e-12)
@@ -260,8 +257,10 @@ def out_and_back(away=15):
     return [scan(k, seen[k]) if k in seen else scan(k) for k in range(1, 41 + away)]
 
 
-@pytest.mark.parametrize('association', ['gnn', 'jipda'])
-@pytest.mark.parametrize('model_set', ['families', 'heading_speed', 'linear'])
+@pytest.mark.parametrize(
+    'association, model_set',
+    [('gnn', 'families'), ('jipda', 'families'), ('jipda', 'heading_speed'), ('gnn', 'linear')],
+)
 def test_who_leaves_the_sector_keeps_his_track(association, model_set):
     plain = DiverConfig(association=association, model_set=model_set)
     for config, tracks in ((plain, 2), (evolve(plain, coverage_sector=AHEAD), 1)):

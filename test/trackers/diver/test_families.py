@@ -9,11 +9,11 @@
 """Families: the vectors of an independent prototype, and what the set promises its users."""
 
 import math
-from pathlib import Path
 
 from attrs import evolve
 from helpers.diver_runs import fix, run, scan_of
 from helpers.estimates import same
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
@@ -24,8 +24,6 @@ from sonar_imm.trackers.diver.config import TARGETS
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
-
-VECTORS = Path(__file__).parents[2] / 'vectors/regret_free'
 
 
 def config(**values):
@@ -47,12 +45,12 @@ def used(kind):
 
 
 def test_chain_and_models_are_those_of_the_prototype(models):
-    with np.load(VECTORS / 'mixing.npz') as vectors:
-        np.testing.assert_allclose(models.chain.generator, vectors['generator'], atol=1e-12)
-        for name, dt in (('transition_1s', 1.0), ('transition_07s', 0.7)):
-            np.testing.assert_allclose(models.chain.transition(dt), vectors[name], atol=1e-12)
-        np.testing.assert_array_equal(models.families.kind, vectors['kind'])
-        assert models.families.sector == pytest.approx(vectors['sector_variance'])
+    vectors = load_vectors('regret_free/mixing')
+    np.testing.assert_allclose(models.chain.generator, vectors['generator'], atol=1e-12)
+    for name, dt in (('transition_1s', 1.0), ('transition_07s', 0.7)):
+        np.testing.assert_allclose(models.chain.transition(dt), vectors[name], atol=1e-12)
+    np.testing.assert_array_equal(models.families.kind, vectors['kind'])
+    assert models.families.sector == pytest.approx(vectors['sector_variance'])
 
 
 def mixed(models, x, P, mu, transition):
@@ -62,50 +60,50 @@ def mixed(models, x, P, mu, transition):
 
 
 def test_mixing_is_that_of_the_prototype(models):
-    with np.load(VECTORS / 'mixing.npz') as vectors:
-        assert vectors['speed_mean'] == 0.75 and vectors['speed_variance'] == pytest.approx(0.16)
-        parts = (vectors[name] for name in ('x', 'P', 'mu'))
-        x, P, c = mixed(models, *parts, vectors['transition_1s'][None])
-        np.testing.assert_allclose(c, vectors['out_c'], rtol=1e-12)
-        for kind, mean, covariance, due_x, due_P in zip(
-            vectors['kind'], x, P, vectors['out_x'], vectors['out_P']
-        ):
-            own = used(kind)
-            square = np.ix_(own, own)
-            np.testing.assert_allclose(mean[own], due_x[own], rtol=1e-12, atol=1e-12)
-            np.testing.assert_allclose(covariance[square], due_P[square], rtol=1e-12, atol=1e-12)
+    vectors = load_vectors('regret_free/mixing')
+    assert vectors['speed_mean'] == 0.75 and vectors['speed_variance'] == pytest.approx(0.16)
+    parts = (vectors[name] for name in ('x', 'P', 'mu'))
+    x, P, c = mixed(models, *parts, vectors['transition_1s'][None])
+    np.testing.assert_allclose(c, vectors['out_c'], rtol=1e-12)
+    for kind, mean, covariance, due_x, due_P in zip(
+        vectors['kind'], x, P, vectors['out_x'], vectors['out_P']
+    ):
+        own = used(kind)
+        square = np.ix_(own, own)
+        np.testing.assert_allclose(mean[own], due_x[own], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(covariance[square], due_P[square], rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(
     'pair', ['heading_to_cv', 'cv_to_heading', 'cv_to_hover', 'hover_to_cv', 'heading_to_heading']
 )
 def test_image_of_one_model_in_the_components_of_another(models, pair):
-    with np.load(VECTORS / 'mixing.npz') as vectors:
-        source, target = int(vectors[f'{pair}/in_model']), int(vectors[f'{pair}/out_model'])
-        only = np.zeros(37)
-        only[source] = 1.0
-        everywhere = np.full((1, 37, 37), 1.0 / 37.0)
-        x, P, _ = mixed(models, vectors['x'], vectors['P'], only, everywhere)
-        own = used(models.families.kind[target])
-        np.testing.assert_allclose(x[target][own], vectors[f'{pair}/x'][own], atol=1e-12)
-        covariance = vectors[f'{pair}/P'][np.ix_(own, own)]
-        np.testing.assert_allclose(P[target][np.ix_(own, own)], covariance, atol=1e-12)
+    vectors = load_vectors('regret_free/mixing')
+    source, target = int(vectors[f'{pair}/in_model']), int(vectors[f'{pair}/out_model'])
+    only = np.zeros(37)
+    only[source] = 1.0
+    everywhere = np.full((1, 37, 37), 1.0 / 37.0)
+    x, P, _ = mixed(models, vectors['x'], vectors['P'], only, everywhere)
+    own = used(models.families.kind[target])
+    np.testing.assert_allclose(x[target][own], vectors[f'{pair}/x'][own], atol=1e-12)
+    covariance = vectors[f'{pair}/P'][np.ix_(own, own)]
+    np.testing.assert_allclose(P[target][np.ix_(own, own)], covariance, atol=1e-12)
 
 
 def test_a_velocity_goes_to_the_headings_it_may_have(models):
     """The probability is shared by the direction of the velocity, not by the chain."""
-    with np.load(VECTORS / 'mixing.npz') as vectors:
-        source = int(vectors['cv_to_heading/in_model'])
-        only = np.zeros(37)
-        only[source] = 1.0
-        transition = vectors['transition_1s'][None]
-        _, _, c = mixed(models, vectors['x'], 0.01 * vectors['P'], only, transition)
-        velocity = vectors['x'][source, 2:]
-        headings = models.families.kind == 0
-        likeliest = models.families.units[headings][c[headings].argmax()]
-        assert likeliest @ velocity > 0.9 * np.hypot(*velocity)
-        np.testing.assert_allclose(c[headings].sum(), transition[0, source, headings].sum())
-        np.testing.assert_allclose(c[~headings], transition[0, source, ~headings], atol=1e-15)
+    vectors = load_vectors('regret_free/mixing')
+    source = int(vectors['cv_to_heading/in_model'])
+    only = np.zeros(37)
+    only[source] = 1.0
+    transition = vectors['transition_1s'][None]
+    _, _, c = mixed(models, vectors['x'], 0.01 * vectors['P'], only, transition)
+    velocity = vectors['x'][source, 2:]
+    headings = models.families.kind == 0
+    likeliest = models.families.units[headings][c[headings].argmax()]
+    assert likeliest @ velocity > 0.9 * np.hypot(*velocity)
+    np.testing.assert_allclose(c[headings].sum(), transition[0, source, headings].sum())
+    np.testing.assert_allclose(c[~headings], transition[0, source, ~headings], atol=1e-15)
 
 
 def test_a_run_is_that_of_the_prototype(monkeypatch):
@@ -116,19 +114,19 @@ def test_a_run_is_that_of_the_prototype(monkeypatch):
     tracker = DiverTracker(config(**fixed, covariance_scales=(1.0, 3.0, 10.0)))
     exact = tracker.models.chain.transition
     tracker._chain.transition = lambda learnt, dt: np.array(exact(round(dt, 6))[None])
-    with np.load(VECTORS / 'run.npz') as run:
-        np.testing.assert_allclose(tracker.models.initial, run['start_mu'], atol=1e-15)
-        assert tuple(run['scales']) == tracker.config.covariance_scales
-        for k, t in enumerate(run['t']):
-            estimate = tracker.process(fix(1.0 + t, *run['z'][k], run['R'][k]))[-1]
-            known = tracker._stream.state.rows
-            for found, name in (
-                (estimate.state[0], 'out_x'),
-                (estimate.covariance[0], 'out_P'),
-                (known.weight, 'out_scale_probability'),
-                *((known.mu[copy], f'copy{copy}/mu') for copy in range(3)),
-            ):
-                np.testing.assert_allclose(found, run[name][k], atol=1e-9)
+    run = load_vectors('regret_free/run')
+    np.testing.assert_allclose(tracker.models.initial, run['start_mu'], atol=1e-15)
+    assert tuple(run['scales']) == tracker.config.covariance_scales
+    for k, t in enumerate(run['t']):
+        estimate = tracker.process(fix(1.0 + t, *run['z'][k], run['R'][k]))[-1]
+        known = tracker._stream.state.rows
+        for found, name in (
+            (estimate.state[0], 'out_x'),
+            (estimate.covariance[0], 'out_P'),
+            (known.weight, 'out_scale_probability'),
+            *((known.mu[copy], f'copy{copy}/mu') for copy in range(3)),
+        ):
+            np.testing.assert_allclose(found, run[name][k], atol=1e-9)
 
 
 def test_who_stood_for_minutes_goes_on_at_a_pace_of_his_own(monkeypatch):
@@ -311,23 +309,29 @@ def test_one_row_and_no_hover():
     assert np.abs(estimate.state[0, :2] - [20.3, 0.0]).max() < 1.0
 
 
-def boat(speed, dt, count, std, name=NOBODY):
+def boat(speed, count, std, name=NOBODY):
     """Fixes of a boat that turns slowly, and its true path (count, 2)."""
-    turn = 0.01 * dt * np.arange(count)
+    turn = 0.01 * np.arange(count)
     truth = speed / 0.01 * np.column_stack([np.sin(turn), 1.0 - np.cos(turn)])
     at = truth + std * np.random.default_rng(3).normal(size=truth.shape)
     ids = None if name == NOBODY else [name]
-    return [scan_of(1 + k * dt, [z], std, target_id=ids) for k, z in enumerate(at)], truth
+    return [scan_of(1 + k, [z], std, target_id=ids) for k, z in enumerate(at)], truth
 
 
-@pytest.mark.parametrize('name', [NOBODY, 7], ids=['no name', 'name'])
-@pytest.mark.parametrize('association', ['gnn', 'jipda'])
-@pytest.mark.parametrize(('speed', 'dt', 'std'), [(8.0, 1.0, 0.3), (12.0, 1.0, 1.0)])
+@pytest.mark.parametrize(
+    'association, name, speed, std',
+    [
+        ('gnn', NOBODY, 8.0, 0.3),
+        ('gnn', 7, 12.0, 1.0),
+        ('jipda', NOBODY, 12.0, 1.0),
+        ('jipda', 7, 8.0, 0.3),
+    ],
+)
 def test_what_is_faster_than_any_diver_is_tracked_from_its_third_fix(
-    association, name, speed, dt, std
+    association, name, speed, std
 ):
     tracker = DiverTracker(DiverConfig(association=association))
-    fixes, truth = boat(speed, dt, 20, std, name)
+    fixes, truth = boat(speed, 20, std, name)
     made = [tracker.process(item)[-1] for item in fixes]
     assert {tuple(each.extras['track_id'].tolist()) for each in made} == {(1,)}
     assert all(each.extras['track_state'][0] > 0 for each in made[2:])
@@ -341,7 +345,7 @@ def test_what_is_faster_than_any_diver_is_tracked_from_its_third_fix(
 def test_fixes_that_nothing_that_swims_can_cause_are_no_track_and_warn():
     """In millimetres, as it may be."""
     tracker = DiverTracker(DiverConfig())
-    fixes, _ = boat(800.0, 1.0, 30, 0.3)
+    fixes, _ = boat(800.0, 30, 0.3)
     made = [tracker.process(item)[-1] for item in fixes]
     assert not any((each.extras['track_state'] > 0).any() for each in made)
     (sentence,) = tracker.warnings()

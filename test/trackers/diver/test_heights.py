@@ -172,22 +172,16 @@ def test_what_is_less_than_the_water_column_says_does_not_replace_it():
     ],
 )
 def test_what_states_no_height_that_can_be_true_changes_no_bit(covariance):
-    def run(stated):
-        tracker = DiverTracker(DiverConfig(dimensions=3))
+    def run(stated, dimensions=3):
+        tracker = DiverTracker(DiverConfig(dimensions=dimensions))
         return last(tracker, [fix(k, -5.0, stated, 0.5 * k) for k in range(1, 8)])
 
+    # Two dimensions take no notice of any.
+    assert run(spatial(0.25, 0.3), 2).state.tobytes() == run(covariance, 2).state.tobytes()
     plain, found = run(np.eye(2)), run(covariance)
     assert found.state.tobytes() == plain.state.tobytes()
     assert found.covariance.tobytes() == plain.covariance.tobytes()
     assert found.covariance[0, Z, Z] > 25.0
-
-
-def test_two_dimensions_take_no_notice_of_it():
-    def run(stated):
-        tracker = DiverTracker(DiverConfig())
-        return last(tracker, [fix(k, -5.0, stated, 0.5 * k) for k in range(1, 8)])
-
-    assert run(spatial(0.25, 0.3)).state.tobytes() == run(np.eye(2)).state.tobytes()
 
 
 def at_ten(tracker, more, seconds=range(1, 21)):

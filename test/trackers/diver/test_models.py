@@ -8,8 +8,7 @@
 
 """The motion models, and lists of hypotheses: each of them alone, mixtures by their definition."""
 
-from pathlib import Path
-
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
@@ -77,14 +76,14 @@ def test_the_set_is_that_of_the_reference():
     models = build_models(config)
     F, Q, B = models.motion(1.0)
     ours = {'F': F, 'B': B, 'E': models.E, 'Pi': models.chain.matrix}
-    with np.load(Path(__file__).parents[2] / 'vectors/diver/imm_reference.npz') as reference:
-        for key, value in ours.items():
-            wanted = reference[f'A12_speedstate16_hover/{key}']
-            np.testing.assert_allclose(value, wanted, atol=1e-12)
-        # The speed's random walk is integrated over the step, exactly: a third, not all, of its
-        # square reaches the position.
-        wanted = reference['A12_speedstate16_hover/Q']
-        np.testing.assert_allclose(Q, wanted, atol=config.speed_noise**2)
+    reference = load_vectors('diver/imm_reference')
+    for key, value in ours.items():
+        wanted = reference[f'A12_speedstate16_hover/{key}']
+        np.testing.assert_allclose(value, wanted, atol=1e-12)
+    # The speed's random walk is integrated over the step, exactly: a third, not all, of its
+    # square reaches the position.
+    wanted = reference['A12_speedstate16_hover/Q']
+    np.testing.assert_allclose(Q, wanted, atol=config.speed_noise**2)
 
 
 def test_headings_and_the_velocity_they_put_out():

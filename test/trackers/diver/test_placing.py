@@ -343,8 +343,10 @@ def on_earth_and_back(origin, vessel, east_north_up):
     return np.array(pymap3d.geodetic2enu(*there, *origin))[:2]
 
 
-@pytest.mark.parametrize('latitude', [0.0, 60.0, -60.0, 80.0, 88.0, -88.0])
-@pytest.mark.parametrize('levelled', [False, True])
+@pytest.mark.parametrize(
+    'latitude, levelled',
+    [(0.0, False), (60.0, True), (-60.0, False), (80.0, False), (88.0, True), (-88.0, False)],
+)
 def test_relative_positions_far_from_the_origin_are_exact_up_to_88_degrees(latitude, levelled):
     """A vessel 10 km from the origin, a diver 1 km from the vessel."""
     origin = (latitude, 170.0, 12.0)
@@ -372,13 +374,6 @@ def test_magnetic_north_is_turned_to_true_north(levelled):
     assert found == pytest.approx([east, north], abs=0.01)
 
 
-def test_the_declination_turns_no_pose_of_nav():
-    config = DiverConfig(magnetic_declination_deg=20.0)
-    poses = [pose(s, (0, 0, 0), 0.0) for s in (1, 2)]
-    (estimate,) = run(DiverTracker(config), [*poses, relative(1.5, (30.0, 0.0, 0.0))])
-    assert estimate.state[0, :2] == pytest.approx([30.0, 0.0], abs=0.05)
-
-
 def test_covariances_turn_with_the_axes():
     """At 88 degrees of latitude, 90 degrees of longitude from the origin, north is west."""
     place = {'origin': (88.0, 1.0, 0.0)}
@@ -397,20 +392,24 @@ def test_covariances_turn_with_the_axes():
     assert np.diag(P) == pytest.approx([1.0, 25.0], rel=0.05)
 
 
-def test_a_transceiver_on_a_pier_needs_no_pose():
-    config = DiverConfig(
-        vessel='fixed', transceiver_lever=(5.0, 0, 0), transceiver_mount_rpy_deg=(0.0, 0.0, 90.0)
-    )
-    (estimate,) = run(DiverTracker(config), [relative(1, (10.0, 0.0, 0.0))])
-    assert estimate.state[0, :2] == pytest.approx([5.0, 10.0], abs=0.05)
+PIER = {'vessel': 'fixed', 'transceiver_lever': (5.0, 0.0, 0.0)}
+PIER |= {'transceiver_mount_rpy_deg': (0.0, 0.0, 90.0)}
 
 
-def test_levelled_positions_do_not_turn_with_the_vessel():
-    poses = [pose(s, (0, 0, 0), 1.0) for s in (1, 2)]
-    (estimate,) = run(
-        DiverTracker(DiverConfig()), [*poses, relative(1.5, (30.0, 0.0, 0.0), levelled=True)]
-    )
-    assert estimate.state[0, :2] == pytest.approx([30.0, 0.0], abs=0.05)
+@pytest.mark.parametrize(
+    'config, yaw, levelled, place',
+    [
+        ({}, 1.0, True, [30.0, 0.0]),
+        ({'magnetic_declination_deg': 20.0}, 0.0, False, [30.0, 0.0]),
+        (PIER, None, False, [5.0, 30.0]),
+    ],
+    ids=['levelled', 'declination turns no pose of nav', 'a pier needs no pose'],
+)
+def test_what_does_not_turn_with_the_vessel(config, yaw, levelled, place):
+    poses = [] if yaw is None else [pose(s, (0, 0, 0), yaw) for s in (1, 2)]
+    seen = relative(1.5, (30.0, 0.0, 0.0), levelled=levelled)
+    (estimate,) = run(DiverTracker(DiverConfig(**config)), [*poses, seen])
+    assert estimate.state[0, :2] == pytest.approx(place, abs=0.05)
 
 
 @pytest.mark.statistics

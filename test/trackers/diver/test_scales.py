@@ -8,10 +8,9 @@
 
 """Covariance scales: found over eight orders of magnitude, named truly, and cheap when absurd."""
 
-from pathlib import Path
-
 from attrs import evolve
 from helpers.diver_runs import fix, scan_of
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
@@ -30,7 +29,6 @@ from sonar_imm.trackers.diver.scales import (
 from sonar_imm.trackers.diver.scan import Scan
 from sonar_imm.trackers.diver.tracker import DiverTracker
 
-FIELD = Path(__file__).resolve().parents[2] / 'vectors' / 'diver_in_the_field'
 WARNED = 'fix covariances too small by a factor'
 
 
@@ -325,8 +323,7 @@ def test_a_delay_is_measured_as_a_move_back_along_the_velocity():
 
 def test_late_density_is_that_of_the_prototype():
     """The fix of `offset.npz` with each delay: position minus delay times velocity."""
-    with np.load(FIELD / 'offset.npz') as vectors:
-        v = {name: vectors[name] for name in vectors.files}
+    v = load_vectors('diver_in_the_field/offset')
     models = build_models(DiverConfig())
     x, P = v['x'][:, :4].copy(), v['P'][:, :4, :4].copy()
     blocks = models.to_blocks(x[None], P[None])

@@ -8,10 +8,9 @@
 
 """What arrivals leave open: sides of a line, pings with one arrival, times that are rounded."""
 
-from pathlib import Path
-
 from attrs import evolve
 from helpers.diver_runs import arrivals, fix, SECOND
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -23,7 +22,6 @@ from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
-VECTORS = Path(__file__).parents[2] / 'vectors/diver_in_the_field'
 RECEIVERS = np.array([[-40.0, 0.0, 0.0], [40.0, 0.0, 0.0], [10.0, 70.0, 0.0]])
 TURNED = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
 """By an angle between two headings of the models."""
@@ -60,19 +58,19 @@ def rows_of(models, x, P, mu):
 def test_the_image_is_that_of_an_independent_prototype():
     config = DiverConfig(covariance_scales=(1.0,))
     models, layout = build_models(config), layout_of(config, build_models(config))
-    with np.load(VECTORS / 'mirror.npz') as found:
-        x, P, a, b = (found[name] for name in ('x', 'P', 'a', 'b'))
-        line = sides.line_through(np.array([a, b]), 0.5)
-        quiet = np.eye(len(models.names))[-1]
-        each = np.tile(x, (len(quiet), 1)), np.tile(P, (len(quiet), 1, 1))
-        rows = sides.with_images(rows_of(models, *each, quiet), 0, models, layout, line)
-        image = rows.blocks[1]
-        np.testing.assert_allclose(image.x[1, :, -1], found['mirrored_x'], atol=1e-12)
-        np.testing.assert_allclose(image.P[1, :, :, -1], found['mirrored_P'], atol=1e-12)
-        parts = rows.blocks[1].x[..., -1], rows.blocks[1].P[..., -1]
-        mean, covariance = rows.combine(*parts, rows.weight)
-        np.testing.assert_allclose(mean[0], found['mean'], atol=1e-12)
-        np.testing.assert_allclose(covariance[0], found['cov'], atol=1e-10)
+    found = load_vectors('diver_in_the_field/mirror')
+    x, P, a, b = (found[name] for name in ('x', 'P', 'a', 'b'))
+    line = sides.line_through(np.array([a, b]), 0.5)
+    quiet = np.eye(len(models.names))[-1]
+    each = np.tile(x, (len(quiet), 1)), np.tile(P, (len(quiet), 1, 1))
+    rows = sides.with_images(rows_of(models, *each, quiet), 0, models, layout, line)
+    image = rows.blocks[1]
+    np.testing.assert_allclose(image.x[1, :, -1], found['mirrored_x'], atol=1e-12)
+    np.testing.assert_allclose(image.P[1, :, :, -1], found['mirrored_P'], atol=1e-12)
+    parts = rows.blocks[1].x[..., -1], rows.blocks[1].P[..., -1]
+    mean, covariance = rows.combine(*parts, rows.weight)
+    np.testing.assert_allclose(mean[0], found['mean'], atol=1e-12)
+    np.testing.assert_allclose(covariance[0], found['cov'], atol=1e-10)
     np.testing.assert_allclose(rows.weight, 0.5)
 
 
@@ -365,14 +363,14 @@ def tracked(step, **how):
 
 
 def test_the_resolution_is_that_of_an_independent_program():
-    v = np.load(VECTORS / 'quantum.npz')
+    v = load_vectors('diver_in_the_field/quantum')
     found = [Resolution().after(stamps).seconds for stamps in v['stamps_ns']]
     np.testing.assert_allclose(found, v['seconds'], rtol=1e-12)
     assert Resolution().after(v['few']).seconds == v['few_seconds'] == 0.0
 
 
 def test_the_resolution_is_that_of_all_times_in_whatever_parts_they_come():
-    stamps = np.load(VECTORS / 'quantum.npz')['stamps_ns'][1]
+    stamps = load_vectors('diver_in_the_field/quantum')['stamps_ns'][1]
     known = Resolution()
     for part in np.array_split(stamps, 9):
         known = known.after(part)
@@ -396,8 +394,7 @@ def test_stamps_of_messages_on_whole_seconds_are_no_resolution(active):
     assert known.resolution == 0.0 and 339.0 < known.span < 340.0
 
 
-@pytest.mark.parametrize('step', [1e-3, 1e-2])
-@pytest.mark.parametrize('active', [False, True])
+@pytest.mark.parametrize('step, active', [(1e-3, True), (1e-2, False)])
 def test_rounding_is_counted_in(step, active):
     _, squared, tracker = tracked(step, active=active)
     assert len(squared) > 25 and squared.mean() < 3.0 and (squared < 5.99).mean() > 0.85

@@ -8,8 +8,6 @@
 
 """The fathometer tracker with arrays: lost blocks, faulty hydrophones, echoes of either sign."""
 
-from pathlib import Path
-
 from attrs import evolve
 from helpers.fathometer_runs import run
 from helpers.fathometer_vectors import signed_sets
@@ -292,13 +290,10 @@ def test_many_that_differ_are_in_one_sentence(scene):
     assert sentence.endswith('more; their signals were levelled')
 
 
-VECTORS = Path(__file__).parents[2] / 'vectors'
-
-
 @pytest.mark.parametrize('compiled', [False, True])
 def test_a_set_with_a_wrong_sign_is_impossible(compiled):
     impossible = 0
-    for case in signed_sets(VECTORS):
+    for case in signed_sets():
         if compiled:
             filter_ = SetFilter(case.model, 1)
             record = filter_.record(case.response, (0, 0))

@@ -9,7 +9,6 @@
 """What is reported of a reflector: times, depths in the sediment, and whether it is a multiple."""
 
 import itertools
-from pathlib import Path
 
 from attrs import evolve
 from helpers import fathometer_vectors
@@ -39,11 +38,9 @@ from sonar_imm.trackers.fathometer.reflectors import (
 from sonar_imm.trackers.fathometer.response import Lattice, pulse_of, Response
 from sonar_imm.trackers.fathometer.tracker import FathometerTracker
 
-VECTORS = Path(__file__).parents[2] / 'vectors'
-
 
 def test_the_thickness_of_sediment_is_that_of_the_vectors():
-    assert fathometer_vectors.sediment(VECTORS) < 1e-9
+    assert fathometer_vectors.sediment() < 1e-9
 
 
 def reflectors(depth, is_bottom):
@@ -58,9 +55,7 @@ def test_depths_below_the_bottom_are_those_of_the_sediment():
     thickness = 40.0 * 1600.0 / 1500.0
     assert depth == pytest.approx([55.0, 60.0, 60.0 + thickness], abs=1e-12)
     assert std == pytest.approx([0.1, 0.1, np.hypot(0.1, 0.05 * thickness)])
-
-
-def test_without_a_speed_the_sediment_is_as_the_water():
+    # Without a speed it is as the water.
     depth, std = sediment_depths(reflectors([60.0, 100.0], [1.0, 0.0]), FathometerConfig())
     assert depth == pytest.approx([60.0, 100.0]) and std == pytest.approx([0.1, 0.1])
     nothing = sediment_depths(reflectors([], []), FathometerConfig())

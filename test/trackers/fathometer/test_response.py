@@ -9,7 +9,6 @@
 """From pressure to the response: snapshots, noise where no echo is, coherence or correlation."""
 
 from collections import Counter
-from pathlib import Path
 
 from attrs import evolve
 from helpers import fathometer_vectors
@@ -210,7 +209,6 @@ def test_the_pulse_of_an_envelope():
         envelope_pulse(10.0, 5.0, 1500.0)
 
 
-VECTORS = Path(__file__).parents[2] / 'vectors'
 SHORT = {
     'phones': 6, 'frequency_max': 900.0, 'record_seconds': 4.0, 'depth_min': 85.0,
     'depth_max': 100.0, 'particles': 100,
@@ -303,9 +301,7 @@ def test_an_array_that_heaves_within_a_record_is_said_and_its_mean_is_taken():
     # From record to record it may heave.
     slow, _ = run(noise(8.0, depths=np.repeat([80.0, 81.0], 8)), **SHORT)
     assert not slow.counts['heave_within_record'] and slow.counts['used'] == 2
-
-
-def test_heave_that_a_companion_tells_counts_as_well():
+    # What a companion tells counts as well.
     blocks = [evolve(each, reference_depth=None) for each in noise(4.0)]
     stated = [
         ArrayDepth(stamp_ns=each.stamp_ns, depth=80.0 + 0.2 * (k % 2))
@@ -385,7 +381,7 @@ def collected(vectors, record):
 
 def test_what_is_made_of_pressure_is_what_the_vectors_have():
     """Cross-spectra, coherence, spectrum and pulse of the processor, response, mirror noise."""
-    errors = fathometer_vectors.pressure(VECTORS)
+    errors = fathometer_vectors.pressure()
     assert len(errors) == 6
     assert {name: error for name, error in errors.items() if not error < 1e-4} == {}
 

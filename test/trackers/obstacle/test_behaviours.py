@@ -12,8 +12,7 @@ from types import SimpleNamespace
 
 from attrs import evolve
 from helpers.estimates import same
-from helpers.obstacle_crossing import crossing
-from helpers.obstacle_runs import navigation, offset_at, rows, SECOND, track_scene
+from helpers.obstacle_runs import crossing, navigation, offset_at, rows, SECOND, track_scene
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

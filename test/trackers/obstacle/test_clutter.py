@@ -8,10 +8,9 @@
 
 """Obstacles in clutter: density, existence, seeds, scales; and what misses say of the height."""
 
-from pathlib import Path
-
 from attrs import evolve
 from helpers.obstacle_runs import followed, SECOND, tracked
+from helpers.vector_files import load_vectors
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -46,7 +45,6 @@ from sonar_imm.trackers.obstacle.scales import Scales
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
-VECTORS = Path(__file__).parents[2] / 'vectors' / 'obstacle_in_clutter'
 CONFIG = ObstacleConfig()
 LEVER = (2.0, 0.0, -0.3)
 
@@ -60,9 +58,9 @@ def after_pings(z, ping, false):
 
 
 def test_the_density_is_that_of_the_nearest_false_echoes():
-    with np.load(VECTORS / 'clutter.npz') as v:
-        clutter = after_pings(v['rows'], v['ping'], float(v['weight']))
-        assert_allclose(clutter.density(v['query'], CONFIG), v['density'], rtol=1e-9)
+    v = load_vectors('obstacle_in_clutter/clutter')
+    clutter = after_pings(v['rows'], v['ping'], float(v['weight']))
+    assert_allclose(clutter.density(v['query'], CONFIG), v['density'], rtol=1e-9)
     assert clutter.interval == 0.5
     believed = evolve(CONFIG, clutter_density=0.3)
     assert clutter.density(np.ones((2, 2)), believed).tolist() == [0.3, 0.3]

@@ -9,13 +9,13 @@
 
 """Obstacles that leave the field of view and come back; closest approach and collision."""
 
-from pathlib import Path
 from typing import NamedTuple
 
 from attrs import evolve
 from helpers.obstacle_runs import EXACT
 from helpers.obstacle_sea import column, ENCOUNTERS, tracked
 from helpers.tracked import resumed
+from helpers.vector_files import load_vectors
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -270,13 +270,9 @@ def test_late_pings_change_what_is_remembered_as_in_order():
     assert in_order.known() and shuffled.known() == in_order.known()
 
 
-GOLDEN = Path(__file__).parents[2] / 'vectors' / 'obstacle_sea' / 'cpa_golden.npz'
-
-
 @pytest.fixture(scope='module')
 def golden():
-    with np.load(GOLDEN) as file:
-        return dict(file)
+    return load_vectors('obstacle_sea/cpa_golden')
 
 
 def test_closest_approach_is_exact(golden):
@@ -388,10 +384,7 @@ def test_positions_of_less_than_a_second_are_no_course(seconds):
     for k, second in enumerate(seconds):
         buffer = buffer.added(pose(second, [k, 0.0, 0.0]))
     assert np.isnan(avoidance.course(buffer, 6 * 10**9, 10.0)).all()
-
-
-def test_a_second_of_positions_is_a_course():
-    buffer = NavigationBuffer()
+    whole = NavigationBuffer()
     for second in (4.0, 5.0):
-        buffer = buffer.added(pose(second, [3.0 * second, -second, 0.5]))
-    assert_allclose(avoidance.course(buffer, 5 * 10**9, 10.0), [3.0, -1.0, 0.0], atol=1e-9)
+        whole = whole.added(pose(second, [3.0 * second, -second, 0.5]))
+    assert_allclose(avoidance.course(whole, 5 * 10**9, 10.0), [3.0, -1.0, 0.0], atol=1e-9)

@@ -9,10 +9,9 @@
 """Errors of the navigation: their motion, what obstacles tell each other of them, two
 assumptions."""
 
-from pathlib import Path
-
 from attrs import evolve
 from helpers.obstacle_runs import run, SECOND
+from helpers.vector_files import load_vectors
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -29,13 +28,12 @@ from sonar_imm.trackers.obstacle.unscented import Motion, NAV, Step
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 CONFIG = ObstacleConfig()
-VECTORS = Path(__file__).resolve().parents[2] / 'vectors/obstacle_in_clutter'
 ORDER = [0, 1, 2, 5, 6, 7, 8, 9, 3, 4]
 """Of our states in those of the vectors, (d, delta, z, e_N, e_E, s, psi, b_N, b_E, tau)."""
 
 
 def vectors(name):
-    return dict(np.load(VECTORS / f'{name}.npz'))
+    return load_vectors(f'obstacle_in_clutter/{name}')
 
 
 def moved(data, i, x, P):

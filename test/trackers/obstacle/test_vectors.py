@@ -27,7 +27,6 @@ from numpy.testing import assert_allclose
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
@@ -51,24 +50,9 @@ def test_posterior_is_the_exact_one(name):
 
 
 @pytest.mark.parametrize('name', NOISE_FREE)
-@pytest.mark.parametrize('model', ['plane', 'cone'])
-def test_without_noise_the_offset_is_found(name, model):
-    measurements = approach(name)
-    if model == 'cone':  # the file has the plane azimuth
-        for i, row in enumerate(rows(name)):
-            R = geometry.rotation(row['roll'], row['pitch'], row['yaw'])
-            m = geometry.reconstruct(row['true_range'], row['true_delta'], row['true_dst'], R)
-            d, delta = geometry.project(m, 'cone')
-            ping = measurements[3 * i + 2]
-            if len(ping):
-                measurements[3 * i + 2] = Detections(
-                    stamp_ns=ping.stamp_ns, range=[d], bearing=[-delta]
-                )
-    config = ObstacleConfig(
-        sonar_lever=lever(name), azimuth_model=model, **{**FAITHFUL, **SHARP, 'components': 61}
-    )
-    final = list(run(ObstacleTracker(config), measurements).values())
-    true = rows(name)['true_dst']
+def test_without_noise_the_offset_is_found(name):
+    exact = {**FAITHFUL, **SHARP, 'components': 61}
+    final, true = track_approach(name, **exact), rows(name)['true_dst']
     assert final[60].state[0, 2] == pytest.approx(true[60], abs=0.1)
     assert final[-1].state[0, 2] == pytest.approx(true[-1], abs=0.03)
 
