@@ -43,39 +43,31 @@ def estimate_at(stamp_ns, states, ids, *, stated=None, tentative=False, nis=None
     course = np.degrees(np.arctan2(states[:, 3], states[:, 2])) % 360.0
     probabilities[np.arange(rows), np.rint(course / 22.5).astype(int) % 16] = 0.8
     return Estimate(
-        stamp_ns=stamp_ns,
-        frame_id='map',
-        xyz=np.column_stack([states[:, :2], np.zeros(rows)]),
-        state_names=('px', 'py', 'vx', 'vy'),
-        state=states,
+        stamp_ns=stamp_ns, frame_id='map', xyz=np.column_stack([states[:, :2], np.zeros(rows)]),
+        state_names=('px', 'py', 'vx', 'vy'), state=states,
         covariance=np.tile(covariance() if stated is None else stated, (rows, 1, 1)),
-        model_names=HEADINGS,
-        probabilities=probabilities,
+        model_names=HEADINGS, probabilities=probabilities,
         extras={
             'track_id': np.array(ids, np.uint32),
             'track_state': np.full(rows, 0 if tentative else 1, np.uint8),
             'nis': np.full(rows, np.nan) if nis is None else np.asarray(nis, float),
             'nis_dof': np.full(rows, 0 if nis is None else 2, np.uint16),
         },
-    )
+    )  # fmt: skip
 
 
 def truth_estimate(stamp_ns, states, ids):
     """One stamp of a truth table as it reads back from a bag: states among the extras."""
     states = np.reshape(states, (len(ids), 4))
     return Estimate(
-        stamp_ns=stamp_ns,
-        frame_id='map',
-        state_names=(),
-        state=np.empty((len(ids), 0)),
+        stamp_ns=stamp_ns, frame_id='map', state_names=(), state=np.empty((len(ids), 0)),
         xyz=np.column_stack([states[:, :2], np.zeros(len(ids))]).astype(np.float32),
-        covariance=np.empty((len(ids), 0, 0)),
-        probabilities=np.empty((len(ids), 0)),
+        covariance=np.empty((len(ids), 0, 0)), probabilities=np.empty((len(ids), 0)),
         extras={
             **dict(zip(('px', 'py', 'vx', 'vy'), states.T)),
             'track_id': np.array(ids, np.uint32),
         },
-    )
+    )  # fmt: skip
 
 
 def stamps(times):

@@ -86,20 +86,17 @@ class WalkerTracker:
         used = [fix.position for key, fix in self.fixes.items() if key <= stamp]
         x, y, z = np.mean(used, axis=0)
         return Estimate(
-            stamp_ns=stamp,
-            frame_id=self.fixes[stamp].frame_id,
-            xyz=np.array([[x, y, z]] * 2, np.float32),
-            state_names=('px', 'py', 'vx', 'vy'),
+            stamp_ns=stamp, frame_id=self.fixes[stamp].frame_id,
+            xyz=np.array([[x, y, z]] * 2, np.float32), state_names=('px', 'py', 'vx', 'vy'),
             state=np.array([[x, y, 0.5, -0.25]] * 2),
-            covariance=np.stack([np.diag([1.0, 2.0, 3.0, 4.0])] * 2),
-            model_names=('slow', 'fast'),
+            covariance=np.stack([np.diag([1.0, 2.0, 3.0, 4.0])] * 2), model_names=('slow', 'fast'),
             probabilities=np.array([[self.config.slow_share, self.config.fast_share]] * 2),
             extras={
                 'track_id': np.array([7, 4], np.uint32),
                 'track_state': np.array([1, 2], np.uint8),
                 'nis': np.full(2, 0.5),
             },
-        )
+        )  # fmt: skip
 
 
 class WalkerSystem(System):

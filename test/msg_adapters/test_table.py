@@ -18,8 +18,11 @@ import numpy as np
 import pytest
 
 from msg_adapters import table
+from msg_adapters.arrivals import COLUMNS, read_arrivals, REQUIRED, write_arrivals
+from msg_adapters.fixes import UNKNOWN_VARIANCE
+from msg_adapters.scans import doubt_scan, read_poses, read_scan, write_poses, write_scan
 from msg_adapters.table import decode_table, encode_table
-from sonar_imm.measurements import Rejection
+from sonar_imm.measurements import Arrivals, Fixes, Rejection
 from sonar_imm_tools.recordings.messages import ros_message, typestore
 
 FORMATS = list(table.DATATYPES.values())
@@ -80,12 +83,6 @@ class TestDecode:
         columns = decode_table(message)
         assert columns['v'].tolist() == [[0, 7], [1, 7], [2, 7], [10, 7], [11, 7], [12, 7]]
         assert columns['f'].tolist() == [0, -1, -2, 1, 0, -1]
-
-    def test_overlapping_fields_see_the_same_bytes(self):
-        message = cloud([('word', 0, 6, 1), ('bytes', 0, 2, 4)], bytes([1, 2, 3, 4]), point_step=4)
-        columns = decode_table(message)
-        assert columns['word'].tolist() == [0x04030201]
-        assert columns['bytes'].tolist() == [[1, 2, 3, 4]]
 
     @pytest.mark.parametrize(
         'kind', [bytes, lambda data: array('B', data), lambda data: np.frombuffer(data, np.uint8)]
@@ -279,3 +276,299 @@ def test_a_table_says_whether_all_of_it_is_finite(rows, bad):
     for more, dense in (({}, True), ({'v': np.ones((rows, 2))}, True), ({'b': spoilt}, False),
                         ({'v': pair}, False)):  # fmt: skip
         assert encode({**good, **more}).is_dense == dense
+
+
+# -- tables of fixes
+
+
+STAMP = 1_700_000_000_123_456_789
+FLAT_COVARIANCE = [[4.0, 0.5], [0.5, 9.0]]
+WHOLE = [[4.0, 0.5, 0.25], [0.5, 9.0, 0.5], [0.25, 0.5, 1.0]]
+
+
+def scan(**columns):
+    """Two fixes at (1, 2) and (3, 4); `columns` replace."""
+    full = {
+        'x': [1.0, 3.0], 'y': [2.0, 4.0], 'cov_x_x': np.float32([1.0, 4.0]),
+        'cov_x_y': np.float32([0.5, 0.0]), 'cov_y_y': np.float32([1.0, 9.0]), **columns,
+    }  # fmt: skip
+    full = {name: np.asarray(values) for name, values in full.items() if values is not None}
+    return encode_table(full, stamp_ns=STAMP, frame_id='map', make=ros_message)
+
+
+def doubted(message):
+    return doubt_scan(message, read_scan(message))
+
+
+def test_a_table_is_read_and_turned():
+    got = read_scan(scan(z=[5.0, math.nan], id=np.array([7, -1], np.int32)))
+    assert got.stamp_ns == STAMP and got.frame_id == 'map' and len(got) == 2
+    assert got.position.tolist() == [[1.0, 2.0, 5.0], [3.0, 4.0, 0.0]]
+    flat = got.covariance[:, :2, :2]
+    assert flat.tolist() == [[[1.0, 0.5], [0.5, 1.0]], [[4.0, 0.0], [0.0, 9.0]]]
+    assert np.isnan(got.covariance[:, 2]).all()
+    assert got.target_id.tolist() == [7, -1]
+    assert read_scan(scan()).target_id is None
+    message = scan(z=[5.0, 6.0])
+    got = read_scan(message, world_frame='ned')
+    assert got.position.tolist() == [[2.0, 1.0, -5.0], [4.0, 3.0, -6.0]]
+    assert got.covariance[1, :2, :2].tolist() == [[9.0, 0.0], [0.0, 4.0]]
+
+
+def test_an_empty_scan_is_a_scan_and_an_empty_table_of_something_else_is_none():
+    none = {name: [] for name in ('x', 'y', 'cov_x_x', 'cov_x_y', 'cov_y_y')}
+    assert len(read_scan(scan(**none))) == 0
+    assert reason(read_scan, scan(**dict.fromkeys(none))) == 'missing_column'
+    assert reason(read_scan, scan(cov_x_y=None)) == 'missing_column'
+
+
+def test_unknown_covariances_are_nan_in_their_rows():
+    got = read_scan(scan(cov_x_x=[-1.0, 4.0]))
+    assert np.isnan(got.covariance[0]).all()
+    assert got.covariance[1, :2, :2].tolist() == [[4, 0], [0, 9]]
+    zero = [0.0, 0.0]
+    assert read_scan(scan(cov_x_x=zero, cov_x_y=zero, cov_y_y=zero)).covariance is None
+
+
+@pytest.mark.parametrize(
+    'column, value',
+    [('x', math.nan), ('x', 1e9), ('y', math.inf), ('cov_x_y', 2.0), ('cov_x_x', math.inf),
+     ('cov_x_x', 1e-300)],
+)  # fmt: skip
+def test_rows_that_cannot_be_used_are_left_out_and_doubted(column, value):
+    good = decode_table(scan())[column][1]
+    message = scan(**{column: [value, good]})
+    assert read_scan(message).position.tolist() == [[3.0, 4.0, 0.0]]
+    assert doubted(message) == 'unusable_rows' and doubted(scan()) is None
+
+
+def test_what_cannot_be_used_is_refused_with_its_reason():
+    assert reason(read_scan, scan(x=[math.nan, math.nan])) == 'nan'
+    assert reason(read_scan, scan(x=np.ones((2, 2)))) == 'bad_field'
+    for wrong in (0.5, 3e9):
+        assert reason(read_scan, scan(id=[wrong, 1.0])) == 'out_of_range'
+
+
+@pytest.mark.parametrize(
+    'n, named, deep', [(0, True, True), (1, True, False), (5, False, True), (5, True, True)]
+)
+def test_writing_and_reading_gives_the_same_scan(n, named, deep):
+    rng = np.random.default_rng(n)
+    fixes = Fixes(
+        stamp_ns=STAMP,
+        position=rng.normal(size=(n, 3)) * 1e5,
+        covariance=np.tile(WHOLE if deep else FLAT_COVARIANCE, (n, 1, 1)),
+        target_id=np.arange(n) if named else None,
+        frame_id='map',
+    )
+    message = write_scan(fixes, ros_message)
+    assert ('cov_z_z' in [each.name for each in message.fields]) == (deep and n > 0)
+    again = read_scan(message)
+    assert again.stamp_ns == fixes.stamp_ns and (again.position == fixes.position).all()
+    assert n == 0 or again.covariance.tobytes() == fixes.covariance.tobytes()
+    assert (again.target_id is None) == (not named or n == 0)
+
+
+def test_poses_are_fixes_without_covariance():
+    fixes = Fixes(stamp_ns=STAMP, position=[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], frame_id='map')
+    message = write_poses(fixes, ros_message)
+    got = read_poses(message)
+    assert (got.position == fixes.position).all() and got.covariance is None
+    message.poses[0].position.x = math.nan
+    left = read_poses(message)
+    assert len(left) == 1 and doubt_scan(message, left) == 'unusable_rows'
+    none = Fixes(stamp_ns=1, position=np.empty((0, 3)))
+    assert len(read_poses(write_poses(none, ros_message))) == 0
+
+
+def test_heights_are_read_where_they_are_stated():
+    z = {'z': [5.0, math.nan], 'cov_z_z': [0.25, 0.25]}
+    got = read_scan(scan(**z)).covariance
+    assert got[0].tolist() == [[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.25]]
+    assert np.isnan(got[1, 2]).all()
+    turned = read_scan(scan(**z, cov_x_z=[0.1, 0.0], cov_y_z=[0.2, 0.0]), world_frame='ned')
+    assert turned.covariance[0, 2] == pytest.approx([-0.2, -0.1, 0.25])
+    only = read_scan(scan(**z, cov_x_x=[-1.0, 4.0])).covariance[0]
+    assert np.isnan(only[:2]).all() and only[2, 2] == 0.25
+    assert np.isnan(read_scan(scan(cov_z_z=[1.0, 1.0])).covariance[:, 2]).all()
+
+
+NASTY_CELLS = (1.0, 4.0, 0.5, 0.0, -1.0, 1e-300, 1e9, 1e300, math.nan, math.inf, -math.inf, 1 / 3)
+
+
+@given(
+    values=st.lists(st.sampled_from(NASTY_CELLS), min_size=20, max_size=20),
+    world=st.sampled_from(['enu', 'ned']),
+)
+@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
+def test_hostile_scans_are_refused_or_finite(values, world):
+    deep = ('cov_x_z', 'cov_y_z', 'cov_z_z')
+    names = ('x', 'y', 'z', 'cov_x_x', 'cov_x_y', 'cov_y_y', 'id', *deep)
+    columns = {name: values[2 * k : 2 * k + 2] for k, name in enumerate(names)}
+    try:
+        got = read_scan(scan(**columns), world_frame=world)
+    except Rejection as rejection:
+        assert rejection.reason and rejection.sentence
+        return
+    assert np.isfinite(got.position).all()
+    if got.covariance is not None:
+        flat = got.covariance[:, :2, :2]
+        known = flat[~np.isnan(flat).any(axis=(1, 2))]
+        assert len(known) + np.isnan(flat).all(axis=(1, 2)).sum() == len(flat)
+        whole = got.covariance[~np.isnan(got.covariance).any(axis=(1, 2))]
+        assert (np.linalg.det(whole / np.abs(whole).max(axis=(1, 2))[:, None, None]) > 0.0).all()
+        assert (np.linalg.eigvalsh(known) > 0.0).all() and (known <= 1e10 * UNKNOWN_VARIANCE).all()
+
+
+# -- arrivals
+
+
+def columns(rows=3, **changes):
+    base = {name: np.arange(rows, dtype=np.float64) + 1.0 for name in REQUIRED}
+    base |= {'tx_id': np.zeros(rows, np.uint16), 'rx_id': np.arange(rows, dtype=np.uint16)}
+    base |= {'toa': np.linspace(0.1, 0.2, rows), **changes}
+    return {name: column for name, column in base.items() if column is not None}
+
+
+def message(stamp_ns=10**18, frame_id='map', **changes):
+    return encode_table(columns(**changes), stamp_ns=stamp_ns, frame_id=frame_id, make=ros_message)
+
+
+def test_missing_optional_columns_are_nan_and_bearings_are_wrapped():
+    arrivals = read_arrivals(message())
+    assert len(arrivals) == 3 and not arrivals.passive
+    assert np.isnan(arrivals.var_toa).all() and np.isnan(arrivals.bearing).all()
+    assert np.isnan(arrivals.var_bearing).all()
+    assert arrivals.toa.tolist() == np.linspace(0.1, 0.2, 3).tolist()
+    arrivals = read_arrivals(message(bearing=np.array([0.5, 1.5 * np.pi, np.nan])))
+    assert arrivals.bearing[0] == 0.5 and arrivals.bearing[1] == pytest.approx(-0.5 * np.pi)
+    assert np.isnan(arrivals.bearing[2])
+
+
+def test_bad_rows_are_dropped_one_by_one():
+    arrivals = read_arrivals(
+        message(
+            rows=7,
+            toa=np.array([0.1, np.nan, 0.3, 0.4, 1e9, -0.1, 0.7]),
+            rx_y=np.array([0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 0.0]),
+            tx_x=np.array([0.0, 0.0, 0.0, np.nan, 0.0, 0.0, 0.0]),
+        )
+    )
+    assert arrivals.rx_id.tolist() == [0, 6]
+
+
+def test_without_any_transmitter_the_target_emits():
+    nobody = dict.fromkeys(('tx_x', 'tx_y', 'tx_z'), np.full(3, np.nan))
+    arrivals = read_arrivals(message(**nobody, toa=np.array([0.0, -0.01, 0.2])))
+    assert arrivals.passive and len(arrivals) == 3
+    # Nothing is known of the instant but that it is near the stamp.
+    arrivals = read_arrivals(message(**nobody, toa=np.array([0.0, -1e4, 0.2])))
+    assert arrivals.rx_id.tolist() == [0, 2]
+
+
+def test_variances_that_are_none_or_too_small_become_unknown():
+    variances = np.float32([1e-6, 0.0, -1.0, np.nan, np.inf])
+    arrivals = read_arrivals(message(rows=5, var_toa=variances))
+    assert arrivals.var_toa[0] == np.float32(1e-6) and np.isnan(arrivals.var_toa[1:]).all()
+    arrivals = read_arrivals(
+        message(
+            var_toa=np.float32([1e-14, 1e-19, 1e-14]), bearing=np.zeros(3),
+            var_bearing=np.float32([1e-11, 1e-14, 1e-11]), depth=np.zeros(3),
+            var_depth=np.float32([1e-7, 1e-11, 1e-7]),
+        )
+    )  # fmt: skip
+    for variance in (arrivals.var_toa, arrivals.var_bearing, arrivals.var_depth):
+        assert np.isnan(variance).tolist() == [False, True, False]
+
+
+def test_elevation_and_depth_come_and_go():
+    values = {
+        'elevation': np.array([-0.2, np.nan, 0.1]),
+        'var_elevation': np.float32([1e-4, np.nan, 2e-4]),
+        'depth': np.array([11.0, 11.0, np.inf]),
+        'var_depth': np.float32([0.04, 0.04, 0.0]),
+    }
+    arrivals = read_arrivals(message(**values))
+    again = read_arrivals(write_arrivals(arrivals, ros_message))
+    for item in (arrivals, again):
+        np.testing.assert_array_equal(item.elevation, values['elevation'])
+        np.testing.assert_array_equal(item.depth, [11.0, 11.0, np.nan])
+        np.testing.assert_array_equal(item.var_depth, np.float32([0.04, 0.04, np.nan]))
+        np.testing.assert_array_equal(item.var_elevation, values['var_elevation'])
+    assert np.isnan(read_arrivals(message()).depth).all()
+
+
+@pytest.mark.parametrize(
+    'code, changes',
+    [
+        ('empty', {'rows': 0}),
+        ('missing_column', {'rx_y': None}),
+        ('nan', {'toa': np.full(3, np.nan)}),
+        ('nan', {'tx_x': np.array([1.0, np.nan, 2.0]), 'rx_x': np.array([np.nan, 0.0, np.nan])}),
+        ('out_of_range', {'rx_id': np.array([0.0, 0.5, 2.0])}),
+        ('out_of_range', {'tx_id': np.array([0, -1, 2], np.int32)}),
+        ('out_of_range', {'tx_id': np.array([0, 65536, 2], np.int32)}),
+        *(
+            ('out_of_range', {name: np.array([0.1, degrees, 0.1])})
+            for name in ('bearing', 'elevation')
+            for degrees in (45.0, -45.0)
+        ),
+        ('bad_field', {'toa': np.zeros((3, 2))}),
+        ('bad_stamp', {'stamp_ns': 0}),
+        ('frame_ned', {'frame_id': 'map_ned'}),
+        ('too_large', {'rows': 10_001}),
+    ],
+)
+def test_arrivals_that_cannot_be_used_are_refused_with_their_reason(code, changes):
+    assert reason(read_arrivals, message(**changes)) == code
+
+
+@pytest.mark.parametrize('bearing', [np.full(2, np.nan), np.array([0.3, np.nan])])
+def test_writing_and_reading_gives_the_same_arrivals(bearing):
+    nowhere = np.full((2, 3), np.nan)
+    arrivals = Arrivals(
+        stamp_ns=10**18 + 1, tx_id=[0, 0], rx_id=[3, 65535], tx=nowhere,
+        rx=[[1 / 3, 2.0, -1.0], [4.0, 5.0, 6.0]], toa=[0.0, 0.1],
+        var_toa=np.float32([1e-6, np.nan]), bearing=bearing,
+        var_bearing=np.float32(bearing * 0.1), frame_id='map',
+    )  # fmt: skip
+    again = read_arrivals(write_arrivals(arrivals, ros_message))
+    assert again.stamp_ns == arrivals.stamp_ns and again.frame_id == 'map'
+    for name in ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing'):
+        assert np.array_equal(getattr(again, name), getattr(arrivals, name), equal_nan=True), name
+
+
+NASTY = np.array([0.1, 0.2, 0.5, 1.0, 3.0, 0.0, -1.0, 1e-30, 1e9, 1e30, -1e30, 45.0, 7e4, np.nan,
+                  np.inf, -np.inf])  # fmt: skip
+
+
+@given(
+    rows=st.integers(0, 3),
+    nasty=st.sets(st.sampled_from(COLUMNS), max_size=4),
+    gone=st.sampled_from((None,) * 5 + REQUIRED),
+    values=st.binary(min_size=36, max_size=36),
+    stamp_ns=st.integers(-(10**18), 2 * 10**18),
+    cut=st.sampled_from((0, 0, 0, 1, 40)),
+)
+@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
+def test_hostile_arrivals_are_refused_or_finite(rows, nasty, gone, values, stamp_ns, cut):
+    table = columns(rows=rows)
+    drawn = NASTY[np.frombuffer(values, np.uint8) % len(NASTY)].astype(np.float32)
+    for i, name in enumerate(sorted(nasty)):
+        table[name] = drawn[3 * i : 3 * i + rows]
+    table.pop(gone, None)
+    cloud = encode_table(table, stamp_ns=stamp_ns, frame_id='map', make=ros_message)
+    cloud.data = cloud.data[: len(cloud.data) - cut]
+    try:
+        arrivals = read_arrivals(cloud)
+    except Rejection as rejection:
+        assert rejection.reason and rejection.sentence
+        return
+    assert len(arrivals) and arrivals.stamp_ns > 0
+    assert np.isfinite(arrivals.toa).all() and np.isfinite(arrivals.rx).all()
+    assert arrivals.passive or np.isfinite(arrivals.tx).all()
+    for name in ('var_toa', 'var_bearing'):
+        known = getattr(arrivals, name)[~np.isnan(getattr(arrivals, name))]
+        assert np.isfinite(known).all() and (known > 0.0).all()
+    bearing = arrivals.bearing[~np.isnan(arrivals.bearing)]
+    assert (np.abs(bearing) <= np.pi).all()

@@ -57,20 +57,16 @@ def rig(make_bench):
 def an_estimate(ids, states):
     rows = len(ids)
     return Estimate(
-        stamp_ns=5 * 10**9,
-        frame_id='map',
-        xyz=np.zeros((rows, 3), np.float32),
-        state_names=('px', 'py', 'vx', 'vy'),
-        state=np.arange(4.0 * rows).reshape(rows, 4),
-        covariance=np.tile(np.eye(4), (rows, 1, 1)),
-        model_names=('heading_000', 'hover'),
+        stamp_ns=5 * 10**9, frame_id='map', xyz=np.zeros((rows, 3), np.float32),
+        state_names=('px', 'py', 'vx', 'vy'), state=np.arange(4.0 * rows).reshape(rows, 4),
+        covariance=np.tile(np.eye(4), (rows, 1, 1)), model_names=('heading_000', 'hover'),
         probabilities=np.array([[0.25 + 0.01 * i, 0.75 - 0.01 * i] for i in ids]).reshape(-1, 2),
         extras={
             'track_id': np.array(ids, np.uint32),
             'track_state': np.array(states, np.uint8),
             'nis': np.full(rows, np.nan),
         },
-    )
+    )  # fmt: skip
 
 
 def test_confirmed_divers_are_shown_and_the_oldest_gives_the_probabilities(rig):

@@ -57,14 +57,11 @@ def rig(make_bench):
 def an_estimate(ids, states, above=0.02):
     rows = len(ids)
     return Estimate(
-        stamp_ns=5 * 10**9,
-        frame_id='odom',
+        stamp_ns=5 * 10**9, frame_id='odom',
         xyz=np.tile(np.float32([40.0, 5.0, -23.0]), (rows, 1)),
         state_names=('range', 'bearing', 'vertical_offset'),
-        state=np.tile([40.0, 0.1, 3.0], (rows, 1)),
-        covariance=np.tile(np.eye(3), (rows, 1, 1)),
-        model_names=('above', 'below'),
-        probabilities=np.tile([above, 1.0 - above], (rows, 1)),
+        state=np.tile([40.0, 0.1, 3.0], (rows, 1)), covariance=np.tile(np.eye(3), (rows, 1, 1)),
+        model_names=('above', 'below'), probabilities=np.tile([above, 1.0 - above], (rows, 1)),
         extras={
             'track_id': np.array(ids, np.uint32),
             'track_state': np.array(states, np.uint8),
@@ -73,7 +70,7 @@ def an_estimate(ids, states, above=0.02):
             'prob_fixed': 0.01 * np.array(ids),
             'prob_moving': 1.0 - 0.01 * np.array(ids),
         },
-    )
+    )  # fmt: skip
 
 
 def test_the_bar_reaches_as_far_as_the_band_and_the_right_way_up():

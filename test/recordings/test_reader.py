@@ -61,16 +61,19 @@ def a_part(name, body):
     return f'\n{"=" * 80}\nMSG: my_msgs/{name}\n{body}'
 
 
+def nested(depth, width):
+    """Types within types, each with so many of the next one."""
+    parts = [
+        a_part(f'A{k}', '\n'.join(f'my_msgs/A{k + 1} a{j}' for j in range(width)))
+        for k in range(depth)
+    ]
+    return ''.join(['my_msgs/A0 a', *parts, a_part(f'A{depth}', 'int32 z')])
+
+
 DEFINITIONS = {
     'circular': 'my_msgs/A a' + a_part('A', 'my_msgs/B b') + a_part('B', 'my_msgs/A a'),
-    'deep': 'my_msgs/A0 a'
-    + ''.join(a_part(f'A{k}', f'my_msgs/A{k + 1} a') for k in range(1300))
-    + a_part('A1300', 'int32 z'),
-    'wide': 'my_msgs/A0 a'
-    + ''.join(
-        a_part(f'A{k}', '\n'.join(f'my_msgs/A{k + 1} a{j}' for j in range(10))) for k in range(20)
-    )
-    + a_part('A20', 'int32 z'),
+    'deep': nested(1100, 1),
+    'wide': nested(20, 10),
     'huge array': 'float64[2000000000] x',
     'many fields': '\n'.join(f'float64 f{k}' for k in range(30_000)),
     'many constants': '\n'.join(f'int32 C{k}={k}' for k in range(30_000)) + '\nint32 a',

@@ -418,7 +418,7 @@ def test_damage_is_one_sentence(tmp_path, text, wanted):
         convert_fixes(tmp_path / 'a.gpx', tmp_path / 'out')
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.sampled_from(list(TEXTS)), st.integers(0, 700), st.binary(max_size=3), st.integers(0, 9))
 def test_hostile_bytes_are_no_tracebacks(tmp_path_factory, name, place, written, cut):
     folder = tmp_path_factory.mktemp('track')
