@@ -46,8 +46,7 @@ from sonar_imm.trackers.bathymetry.ping import (
 )
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm.truth import Scene, TrueProfile
-from sonar_imm_tools.evaluation.bathymetry.profiles import profiles_of
-from sonar_imm_tools.evaluation.bathymetry.scoring import score
+from sonar_imm_tools.evaluation.bathymetry.scoring import profiles_of, score
 from sonar_imm_tools.recordings.truth import records_of
 from sonar_imm_tools.simulation.bathymetry.simulator import BathymetryScenario, scenario, simulate
 

@@ -25,8 +25,7 @@ import numpy as np
 from benchmarks.bathymetry_paper import truth_of, WALKS
 from benchmarks.study import Parts, study
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, profiles_of
-from sonar_imm_tools.evaluation.bathymetry.scoring import score
+from sonar_imm_tools.evaluation.bathymetry.scoring import Profile, profiles_of, score
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 APART: dict[str, Any] = {'ping_rate': 0.3, 'patch_along': []}

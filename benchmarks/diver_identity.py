@@ -37,9 +37,8 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack
-from sonar_imm_tools.evaluation.diver.matching import match
 from sonar_imm_tools.evaluation.diver.scoring import score
-from sonar_imm_tools.evaluation.diver.series import Series, series_of, Truth
+from sonar_imm_tools.evaluation.diver.series import match, Series, series_of, Truth
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 ASSOCIATIONS = ('gnn', 'jipda')

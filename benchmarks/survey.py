@@ -51,7 +51,7 @@ from sonar_imm_tools.survey.adjustment import adjust
 from sonar_imm_tools.survey.chart import chart_of
 from sonar_imm_tools.survey.grid import grid_of_looks, Soundings
 from sonar_imm_tools.survey.jobs import Options
-from sonar_imm_tools.survey.line import joined_lines, line_of
+from sonar_imm_tools.survey.line import Line, line_of
 from sonar_imm_tools.survey.looks import Looks, looks_of, runs_of
 from sonar_imm_tools.survey.making import make, Progress, sources_of
 from sonar_imm_tools.survey.products import folder_of, write
@@ -157,7 +157,7 @@ def survey(seed: int, interval: float) -> tuple[dict[str, float], dict[str, dict
         ('not adjusted', lines, None, found.rms[0], 0.0),
     ):
         number = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
-        soundings = Soundings(joined_lines(parts), number)
+        soundings = Soundings(Line.joined(parts), number)
         charts[f'looks, {name}'] = looks_scores(scene.floor, soundings, own, C, left, level_std)
         whole = soundings.line
         x, y = whole.xy.T
@@ -209,7 +209,7 @@ def walls(seed: int) -> dict[str, float]:
     ]
     number = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
     own = evolve(budget(), sound_speed=0.0)
-    nodes = grid_of_looks(Soundings(joined_lines(parts), number), 1.0, (20, 0, 120, 120), own)
+    nodes = grid_of_looks(Soundings(Line.joined(parts), number), 1.0, (20, 0, 120, 120), own)
     x, y = np.asarray(np.column_stack([nodes.ix, nodes.iy]) + 0.5, np.float64).T
     error = nodes.z - scene.floor.at(x, y)
     off = np.abs(error - np.median(error))

@@ -33,7 +33,7 @@ from benchmarks.fathometer_paper import BOOTSTRAP, ChangedTracker  # noqa: E402
 from sonar_imm.acoustics import fathometer  # noqa: E402
 from sonar_imm.measurements import Trace  # noqa: E402
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker  # noqa: E402
-from sonar_imm_tools.evaluation.fathometer.records import records_of  # noqa: E402
+from sonar_imm_tools.evaluation.fathometer.scoring import records_of  # noqa: E402
 from sonar_imm_tools.recordings.convert import convert_segy  # noqa: E402
 from sonar_imm_tools.recordings.measurements import measurements_of  # noqa: E402
 from sonar_imm_tools.recordings.reader import BagReader  # noqa: E402

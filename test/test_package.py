@@ -52,7 +52,7 @@ PEERS = {
     'sonar_imm_tools.recordings.convert.nmea': {'pyais', 'pynmea2'},
     'sonar_imm_tools.recordings.segy_lines': {'segyio'},
     'sonar_imm_tools.recordings.convert.side_scan': {'PIL'},
-    'sonar_imm_tools.recordings.export.horizons': {'rasterio', 'segyio'},
+    'sonar_imm_tools.recordings.export.horizons': {'segyio'},
     'sonar_imm_tools.recordings.csv_writer': {'pyarrow'},
     'sonar_imm_tools.recordings.export.points': {'laspy', 'pyarrow', 'rasterio'},
     'sonar_imm_tools.recordings.export.tracks': {'pyarrow'},

@@ -63,7 +63,7 @@ class NavigationBuffer:
         return NavigationBuffer(self.stamps[first:], self.samples[first:]) if first else self
 
     def readiness(
-        self, first_ns: int, last_ns: int, max_gap_ns: int, max_extrapolation_ns: int
+        self, first_ns: int, last_ns: int, max_gap_ns: int, max_extrapolation_ns: int = 0
     ) -> Readiness:
         """Whether poses from `first_ns` to `last_ns` are known, will be, or never will be."""
         if not self.stamps:

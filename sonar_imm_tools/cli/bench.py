@@ -24,25 +24,17 @@ from sonar_imm.trackers import SYSTEMS
 from .common import BAG, example, json_option, node_file, print_json, say
 
 
+# fmt: off
 @click.command(epilog=example('sonar-imm bench', 'sonar-imm bench diver --json --skip-node'))
 @click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
-@click.option(
-    '--rounds',
-    type=click.IntRange(min=1),
-    default=7,
-    show_default=True,
-    help='Paired rounds against other programs.',
-)
+@click.option('--rounds', type=click.IntRange(min=1), default=7, show_default=True,
+    help='Paired rounds against other programs.')
 @click.option('--bag', type=BAG, help='Recording to time the node with; a shipped one by default.')
 @click.option('--skip-node', is_flag=True, help='Leave out the live node (needs ROS 2).')
 @click.option('--strict', is_flag=True, help='Exit code 1 when a measurement misses its goal.')
 @json_option
 def command(
-    systems: tuple[str, ...],
-    rounds: int,
-    bag: Path | None,
-    skip_node: bool,
-    strict: bool,
+    systems: tuple[str, ...], rounds: int, bag: Path | None, skip_node: bool, strict: bool,
     as_json: bool,
 ) -> None:
     """Measure the speed of the filters, beside other libraries in the same run, and of the nodes.
@@ -70,6 +62,7 @@ def command(
         part.get('good', True) for result in results.values() for part in result.values()
     ):
         raise click.exceptions.Exit(1)
+# fmt: on
 
 
 def _speed() -> ModuleType:

@@ -27,33 +27,22 @@ if TYPE_CHECKING:
     from .checking import CheckedRecording, PlayedRecording
 
 
+# fmt: off
 @click.command(
-    epilog=example('sonar-imm check diver', 'sonar-imm check diver --bag dive.bag --limit 3')
-)
+    epilog=example('sonar-imm check diver', 'sonar-imm check diver --bag dive.bag --limit 3'))
 @click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
 @click.option('--bag', type=BAG, help='Play this recording instead of the shipped ones.')
 @params_option('Parameter file for the node and the offline run.')
-@click.option(
-    '--limit',
-    type=click.FloatRange(min=0.0),
-    metavar='ERROR',
-    help='Largest error allowed, of the kind and in the unit that the check prints, e.g. '
-    'position RMSE in metres for the diver. By default that of the recording (check.yaml in its '
-    'folder), or else of the system.',
-)
-@click.option(
-    '--out',
-    type=click.Path(path_type=Path, file_okay=False),
-    help='Keep both runs in this folder.',
-)
+@click.option('--limit', type=click.FloatRange(min=0.0), metavar='ERROR',
+    help='Largest error allowed, of the kind and in the unit that the check prints, e.g. position '
+    'RMSE in metres for the diver. By default that of the recording (check.yaml in its folder), '
+    'or else of the system.')
+@click.option('--out', type=click.Path(path_type=Path, file_okay=False),
+    help='Keep both runs in this folder.')
 @json_option
 def command(
-    systems: tuple[str, ...],
-    bag: Path | None,
-    params: Path | None,
-    limit: float | None,
-    out: Path | None,
-    as_json: bool,
+    systems: tuple[str, ...], bag: Path | None, params: Path | None, limit: float | None,
+    out: Path | None, as_json: bool,
 ) -> None:
     """Start the real nodes, play recordings to them in lock-step and check their estimates.
 
@@ -78,6 +67,7 @@ def command(
             print_checks(recording)
     if not all(recording.good for recording in recordings):
         raise click.exceptions.Exit(1)
+# fmt: on
 
 
 def run_checks(

@@ -21,7 +21,6 @@ from typing import Any
 
 from attrs import asdict, frozen
 
-from sonar_imm.parameters import Config
 from sonar_imm.trackers import SYSTEMS
 
 from ..evaluation.judging import Check, Judgement
@@ -180,15 +179,11 @@ def play_recording(
             topics=topics,
             progress=advance,
         )
-    _keep(played, config, system, folder / 'live')
+    # In the same form as the offline run.
+    with RunFolder(folder / 'live').fresh(overwrite=True) as live_folder:
+        live_folder.write_estimates(final_estimates(played.estimates, config), system)
     checks = (_answered(played, run), _equal(folder), _ended(played))
     return PlayedRecording(system, bag, folder, limit, checks, played.latency_ms())
-
-
-def _keep(live: LockstepResult, config: Config, system: str, path: Path) -> None:
-    """Write the estimates that the node published in the same form as the offline run."""
-    with RunFolder(path).fresh(overwrite=True) as folder:
-        folder.write_estimates(final_estimates(live.estimates, config), system)
 
 
 def _answered(live: LockstepResult, run: dict[str, Any]) -> Check:
@@ -211,13 +206,11 @@ def _equal(folder: Path) -> Check:
         (second / file).is_file() and (first / file).read_bytes() == (second / file).read_bytes()
         for file in files
     )
-    result = 'equal bytes' if same else f'{_rows_apart(first / CSV, second / CSV)} rows differ'
+    result = 'equal bytes'
+    if not same:
+        rows = ((path / CSV).read_text(encoding='utf-8').split('\n') for path in (first, second))
+        result = f'{sum(a != b for a, b in zip_longest(*rows))} rows differ'
     return Check('estimates of the node against offline', result, 'equal bytes', same)
-
-
-def _rows_apart(first: Path, second: Path) -> int:
-    with first.open(encoding='utf-8') as item, second.open(encoding='utf-8') as other:
-        return sum(a != b for a, b in zip_longest(item, other))
 
 
 def _ended(live: LockstepResult) -> Check:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 import contextlib
+import functools
 import json
 from pathlib import Path
 import sys
@@ -51,13 +52,6 @@ def example(*lines: str) -> str:
     return '\b\nExample:\n' + '\n'.join(f'  {line}' for line in lines)
 
 
-def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``--json``: the result as one JSON object on standard output."""
-    return click.option('--json', 'as_json', is_flag=True, help='Print the result as JSON.')(
-        function
-    )
-
-
 def _coordinates(
     _ctx: click.Context, _param: click.Parameter, value: str
 ) -> tuple[float, float, float]:
@@ -71,35 +65,6 @@ def _coordinates(
     return x, y, z
 
 
-def place_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``--crs`` and ``--origin``: where the local frame lies."""
-    crs = click.option(
-        '--crs',
-        '--epsg',
-        'epsg',
-        type=click.IntRange(min=1),
-        help='Coordinate system, by its EPSG number.',
-    )
-    origin = click.option(
-        '--origin',
-        default='0,0',
-        callback=_coordinates,
-        metavar='X,Y[,Z]',
-        help='Coordinates in that system of the origin of the navigation.',
-    )
-    return crs(origin(function))
-
-
-def set_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``--set name=value``, may be repeated."""
-    return pairs_option(
-        '--set',
-        'overrides',
-        metavar='NAME=VALUE',
-        help='Change one parameter; may be given several times.',
-    )(function)
-
-
 def params_option(help: str) -> Callable[..., Any]:
     """``--params FILE``."""
     return click.option('--params', type=click.Path(path_type=Path, dir_okay=False), help=help)
@@ -108,14 +73,9 @@ def params_option(help: str) -> Callable[..., Any]:
 def timeout_option(default: float, *, when: str = '') -> Callable[..., Any]:
     """``--timeout SECONDS``, of a command that listens to nodes."""
     ends = 'with 1 when nothing is heard for so long from the start.'
-    return click.option(
-        '--timeout',
-        type=click.FloatRange(min=0.0, min_open=True),
-        default=default,
-        show_default=True,
-        metavar='SECONDS',
-        help=f'{when}: end {ends}' if when else f'End {ends}',
-    )
+    return click.option('--timeout', type=click.FloatRange(min=0.0, min_open=True),
+        default=default, show_default=True, metavar='SECONDS',
+        help=f'{when}: end {ends}' if when else f'End {ends}')  # fmt: skip
 
 
 def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
@@ -135,24 +95,22 @@ def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
     return click.option(*names, metavar=metavar, multiple=True, callback=split, help=help)
 
 
-def topic_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``--topic input=topic``, may be repeated; the command gets topics by input."""
-    return pairs_option(
-        '--topic',
-        'topics',
-        metavar='INPUT=TOPIC',
-        help='Topic of an input, e.g. fix=/usbl/pose; may be given several times.',
-    )(function)
-
-
-def system_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``--system``: which tracker; not needed when the bag fits only one."""
-    return click.option(
-        '--system',
-        type=click.Choice(list(SYSTEMS)),
-        default=None,
-        help='Which tracker; by default the one whose inputs are in the bag.',
-    )(function)
+# Options of several commands.
+# fmt: off
+json_option = click.option('--json', 'as_json', is_flag=True, help='Print the result as JSON.')
+set_option = pairs_option('--set', 'overrides', metavar='NAME=VALUE',
+    help='Change one parameter; may be given several times.')
+topic_option = pairs_option('--topic', 'topics', metavar='INPUT=TOPIC',
+    help='Topic of an input, e.g. fix=/usbl/pose; may be given several times.')
+system_option = click.option('--system', type=click.Choice(list(SYSTEMS)), default=None,
+    help='Which tracker; by default the one whose inputs are in the bag.')
+crs_option = click.option('--crs', '--epsg', 'epsg', type=click.IntRange(min=1),
+    help='Coordinate system, by its EPSG number.')
+origin_option = click.option('--origin', default='0,0', callback=_coordinates, metavar='X,Y[,Z]',
+    help='Coordinates in that system of the origin of the navigation.')
+jobs_option = functools.partial(click.option, '--jobs', type=click.IntRange(min=1), default=1,
+    show_default=True)
+# fmt: on
 
 
 def typed_overrides(config_type: type[Config], overrides: dict[str, str]) -> dict[str, Any]:
@@ -294,31 +252,23 @@ def _parameters_of(
     """What a file says for a node of `system`; needed: it is a mistake when it is for others
     only."""
     if isinstance(path, OwnParameters):
-        return _without_common(_taken(path, system, node_name, report))
-    try:
-        text = small_text(path)
-        values = parameters_from_yaml(text, node_name=node_name)
-    except UnicodeDecodeError:
-        raise ConfigError(f'{path} is not a text file') from None
-    except ConfigError as error:
-        raise ConfigError(f'{path}: {error}') from None
-    if needed and not values and (names := _others(text, node_name)):
-        raise ConfigError(
-            f"{path} is for {', '.join(names)}, and not for '{node_name}': rename the section, or "
-            "call it '/**' for any node"
-        )
-    return _without_common(values)
-
-
-def _without_common(values: dict[str, Any]) -> dict[str, Any]:
+        values = _taken(path, system, node_name, report)
+    else:
+        try:
+            text = small_text(path)
+            values = parameters_from_yaml(text, node_name=node_name)
+        except UnicodeDecodeError:
+            raise ConfigError(f'{path} is not a text file') from None
+        except ConfigError as error:
+            raise ConfigError(f'{path}: {error}') from None
+        sections = sections_of(text) if needed and not values else []
+        known = ('/**', '/*')
+        if sections and not any(n in known or n.split('/')[-1] == node_name for n in sections):
+            raise ConfigError(
+                f"{path} is for {', '.join(sections)}, and not for '{node_name}': rename the "
+                "section, or call it '/**' for any node"
+            )
     return {key: value for key, value in values.items() if key.split('.')[0] not in OF_EVERY_NODE}
-
-
-def _others(text: str, node_name: str) -> list[str]:
-    """The nodes that a parameter file is for where `node_name` is not among them."""
-    names = sections_of(text)
-    mine = [name for name in names if name in ('/**', '/*') or name.split('/')[-1] == node_name]
-    return [] if mine else names
 
 
 class Renewed(click.Command):
@@ -337,6 +287,11 @@ def print_json(result: Any) -> None:
     from ..offline.run_folder import finite
 
     click.echo(json.dumps(finite(result), indent=2))
+
+
+def by_topic(messages: Mapping[str, int]) -> str:
+    """How many messages there are, in words."""
+    return ', '.join(f'{count} on {topic}' for topic, count in sorted(messages.items()))
 
 
 def say(text: str = '', *, quiet: bool = False) -> None:

@@ -25,7 +25,9 @@ from ..recordings.convert_options import DETECTING, FROM_BAGS, OPTIONS
 from ..recordings.options import Group, Option, spec_of
 from .common import (
     BAG,
+    by_topic,
     example,
+    jobs_option,
     json_option,
     load_detector,
     pairs_option,
@@ -74,14 +76,10 @@ def _named_columns(args: Sequence[str]) -> dict[str, str]:
     return {name: header for name, equals, header in pairs if equals}
 
 
-@click.group(
-    cls=Convert,
-    invoke_without_command=True,
-    epilog=example(
-        'sonar-imm convert usbl.csv dive.bag',
-        'sonar-imm convert fixes usbl.csv dive.bag --column x=easting --column y=northing',
-    ),
-)
+# fmt: off
+@click.group(cls=Convert, invoke_without_command=True,
+    epilog=example('sonar-imm convert usbl.csv dive.bag',
+        'sonar-imm convert fixes usbl.csv dive.bag --column x=easting --column y=northing'))
 @click.pass_context
 def command(ctx: click.Context) -> None:
     """Turn recordings in other formats into a rosbag2 bag: convert [KIND] IN OUT.
@@ -92,6 +90,7 @@ def command(ctx: click.Context) -> None:
     """
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
+# fmt: on
 
 
 def _add_subcommand(kind: str, options: type) -> None:
@@ -114,13 +113,7 @@ def _add_subcommand(kind: str, options: type) -> None:
     click.argument('out_bag', type=BAG, required=False)(subcommand)
     for decorate in _click_options(options):
         decorate(subcommand)
-    click.option(
-        '--jobs',
-        type=click.IntRange(min=1),
-        default=1,
-        show_default=True,
-        help='Processes, for a folder of several.',
-    )(subcommand)
+    jobs_option(help='Processes, for a folder of several.')(subcommand)
     json_option(subcommand)
     command.add_command(subcommand)
 
@@ -283,7 +276,7 @@ def _convert_all(
     else:
         for entry in content:
             if not entry['failure']:
-                say(f'{entry["bag"]}: {_what(entry["messages"])}, from {entry["rows"]} rows')
+                say(f'{entry["bag"]}: {by_topic(entry["messages"])}, from {entry["rows"]} rows')
         say(f'{len(sources) - failed} bags in {out}' + (f', {failed} failed' if failed else ''))
     if failed:
         raise click.exceptions.Exit(1)
@@ -302,16 +295,12 @@ def _described(report: ConversionReport) -> dict[str, Any]:
     }
 
 
-def _what(messages: dict[str, int]) -> str:
-    return ', '.join(f'{count} on {topic}' for topic, count in sorted(messages.items()))
-
-
 def _print(report: ConversionReport) -> None:
     from ..evaluation.numbers import counted
     from ..recordings.reader import BagReader
     from ..recordings.topics import ready_systems
 
-    say(f'{report.path}: {_what(report.messages)}, from {report.rows} rows')
+    say(f'{report.path}: {by_topic(report.messages)}, from {report.rows} rows')
     for key, value in report.notes.items():
         say(f'  note: {key}: {value}')
     for problem in report.problems:

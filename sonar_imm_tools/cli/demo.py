@@ -27,28 +27,15 @@ if TYPE_CHECKING:
     from .checking import CheckedRecording
 
 
+# fmt: off
 @click.command(epilog=example('sonar-imm demo --out demo', 'sonar-imm demo --system diver --all'))
-@click.option(
-    '--out',
-    type=click.Path(path_type=Path, file_okay=False),
-    default=Path('demo'),
-    show_default=True,
-    help='Folder for the runs and the report.',
-)
-@click.option(
-    '--system',
-    'systems',
-    multiple=True,
-    type=click.Choice(list(SYSTEMS)),
-    help='Show this system alone; may be repeated. All by default.',
-)
-@click.option(
-    '--all',
-    'live_all',
-    is_flag=True,
+@click.option('--out', type=click.Path(path_type=Path, file_okay=False), default=Path('demo'),
+    show_default=True, help='Folder for the runs and the report.')
+@click.option('--system', 'systems', multiple=True, type=click.Choice(list(SYSTEMS)),
+    help='Show this system alone; may be repeated. All by default.')
+@click.option('--all', 'live_all', is_flag=True,
     help='Play every recording to the node. By default only the smallest of each system, which '
-    'comes first; the others are tracked offline.',
-)
+    'comes first; the others are tracked offline.')
 def command(out: Path, systems: tuple[str, ...], live_all: bool) -> None:
     """Play shipped recordings to the real nodes, track all of them offline, write one report.
 
@@ -69,6 +56,7 @@ def command(out: Path, systems: tuple[str, ...], live_all: bool) -> None:
     say(f'report: {report.resolve()}')
     if not all(recording.good for recording in recordings):
         raise click.exceptions.Exit(1)
+# fmt: on
 
 
 def _line(system: str, recordings: Sequence[CheckedRecording]) -> str:

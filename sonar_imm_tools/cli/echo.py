@@ -34,31 +34,19 @@ Rows = list[dict[str, str]]
 Show = Callable[['ReceivedTable'], None]
 
 
+# fmt: off
 @click.command(
-    epilog=example(
-        'sonar-imm echo',
-        'sonar-imm echo /diver/estimate --once',
-        'sonar-imm echo /obstacle/estimate --json | jq .columns.range',
-    )
-)
+    epilog=example('sonar-imm echo', 'sonar-imm echo /diver/estimate --once',
+        'sonar-imm echo /obstacle/estimate --json | jq .columns.range'))
 @click.argument('topics', metavar='[TOPIC]...', nargs=-1)
 @click.option('--once', is_flag=True, help='Show one table and end; the same as --count 1.')
 @click.option('--count', type=click.IntRange(min=1), help='End after so many tables.')
-@click.option(
-    '--rows',
-    type=click.IntRange(min=1),
-    default=20,
-    show_default=True,
-    help='Most rows of a table to show; --json has all.',
-)
+@click.option('--rows', type=click.IntRange(min=1), default=20, show_default=True,
+    help='Most rows of a table to show; --json has all.')
 @timeout_option(10.0)
 @click.option('--json', 'as_json', is_flag=True, help='One line of JSON for each table.')
 def command(
-    topics: tuple[str, ...],
-    once: bool,
-    count: int | None,
-    rows: int,
-    timeout: float,
+    topics: tuple[str, ...], once: bool, count: int | None, rows: int, timeout: float,
     as_json: bool,
 ) -> None:
     """Show the estimates of running nodes: a live table on a terminal, lines elsewhere.
@@ -86,6 +74,7 @@ def command(
                 show(table)
                 if left is not None and (left := left - 1) == 0:
                     return
+# fmt: on
 
 
 @contextlib.contextmanager

@@ -18,77 +18,36 @@ from ..evaluation.judging import judge, Judgement, JudgeOptions, TRUTH_GAP
 from .common import BAG, example, json_option, print_json, say
 
 
+# fmt: off
 @click.command(
-    epilog=example(
-        'sonar-imm evaluate out',
+    epilog=example('sonar-imm evaluate out',
         'sonar-imm evaluate out --truth gps.bag --report gps.html',
-        'sonar-imm evaluate line1 line9 --crossing',
-    )
-)
+        'sonar-imm evaluate line1 line9 --crossing'))
 @click.argument('out_dir', type=click.Path(path_type=Path))
 @click.argument('other', metavar='[OTHER]', required=False, type=click.Path(path_type=Path))
-@click.option(
-    '--truth',
-    'truth_bag',
-    type=BAG,
-    help='Bag with /truth/estimate; by default the tracked bag itself.',
-)
-@click.option(
-    '--truth-lag',
-    type=float,
-    default=0.0,
-    show_default=True,
-    metavar='SECONDS',
-    help='Compare an estimate with truth this much later.',
-)
-@click.option(
-    '--truth-gap',
-    type=click.FloatRange(min=0.0),
-    default=TRUTH_GAP,
-    show_default=True,
-    metavar='SECONDS',
-    help='Truth is not interpolated across longer gaps.',
-)
-@click.option(
-    '--cutoff',
-    type=click.FloatRange(min=0.0, min_open=True),
+@click.option('--truth', 'truth_bag', type=BAG,
+    help='Bag with /truth/estimate; by default the tracked bag itself.')
+@click.option('--truth-lag', type=float, default=0.0, show_default=True, metavar='SECONDS',
+    help='Compare an estimate with truth this much later.')
+@click.option('--truth-gap', type=click.FloatRange(min=0.0), default=TRUTH_GAP, show_default=True,
+    metavar='SECONDS', help='Truth is not interpolated across longer gaps.')
+@click.option('--cutoff', type=click.FloatRange(min=0.0, min_open=True), metavar='METRES',
+    help='An estimate further away from all targets is on none of them; the default depends on '
+    'the system: for divers six times the median distance of the raw fixes (of the tracks where '
+    'there are none) from the truth, and at least 10.')
+@click.option('--report', type=click.Path(path_type=Path, dir_okay=False),
+    help='Where to write the report; by default OUT_DIR/report.html.')
+@click.option('--crossing', is_flag=True,
+    help='Compare the horizons of two fathometer runs, OUT_DIR and OTHER, where they cross.')
+@click.option('--position-std', type=click.FloatRange(min=0.0), default=3.0, show_default=True,
     metavar='METRES',
-    help='An estimate further away from all targets is on none of them; the default depends '
-    'on the system: for divers six times the median distance of the raw fixes (of the tracks '
-    'where there are none) from the truth, and at least 10.',
-)
-@click.option(
-    '--report',
-    type=click.Path(path_type=Path, dir_okay=False),
-    help='Where to write the report; by default OUT_DIR/report.html.',
-)
-@click.option(
-    '--crossing',
-    is_flag=True,
-    help='Compare the horizons of two fathometer runs, OUT_DIR and OTHER, where they cross.',
-)
-@click.option(
-    '--position-std',
-    type=click.FloatRange(min=0.0),
-    default=3.0,
-    show_default=True,
-    metavar='METRES',
-    help='crossing: error of a position, which counts by the slope of a horizon.',
-)
+    help='crossing: error of a position, which counts by the slope of a horizon.')
 @click.option('--no-report', is_flag=True, help='Only write metrics.json.')
 @json_option
 def command(
-    out_dir: Path,
-    other: Path | None,
-    truth_bag: Path | None,
-    truth_lag: float,
-    truth_gap: float,
-    cutoff: float | None,
-    report: Path | None,
-    crossing: bool,
-    position_std: float,
-    no_report: bool,
-    as_json: bool,
+    out_dir: Path, other: Path | None, truth_bag: Path | None, truth_lag: float, truth_gap: float,
+    cutoff: float | None, report: Path | None, crossing: bool, position_std: float,
+    no_report: bool, as_json: bool,
 ) -> None:
     """Score the run, or all runs, that `sonar-imm track` left in OUT_DIR.
 
@@ -125,6 +84,7 @@ def command(
         _print(judgement, '' if folder == out_dir else f'{_name(folder, out_dir)}: ')
     if page is not None:
         say(f'report: {page}')
+# fmt: on
 
 
 def _name(folder: Path, out_dir: Path) -> str:

@@ -21,6 +21,7 @@ from sonar_imm.trackers import SYSTEMS
 from .common import BAG, example, json_option, load_detector, print_json, progress, say
 
 
+# fmt: off
 @click.command(epilog=example('sonar-imm info dive.bag', 'sonar-imm info --json dive.mcap'))
 @click.argument('bag', type=BAG)
 @click.option('--strict', is_flag=True, help='Stop at the first damage instead of reading on.')
@@ -44,6 +45,7 @@ def command(bag: Path, strict: bool, as_json: bool) -> None:
     print_json(found) if as_json else _print(found, heard)
     if not found['systems']:
         raise click.exceptions.Exit(1)
+# fmt: on
 
 
 def _detector(bag: Path) -> dict[str, Any]:

@@ -38,82 +38,33 @@ class ManyWords(click.Command):
         return super().parse_args(ctx, words)
 
 
-@click.command(
-    cls=ManyWords,
-    epilog=example(
-        'sonar-imm play dive.bag --clock',
-        'sonar-imm play dive.bag --lockstep /diver',
-        'sonar-imm play dive.bag --remap /usbl/pose:=/fix --rate 5',
-    ),
-)
+# fmt: off
+@click.command(cls=ManyWords,
+    epilog=example('sonar-imm play dive.bag --clock', 'sonar-imm play dive.bag --lockstep /diver',
+        'sonar-imm play dive.bag --remap /usbl/pose:=/fix --rate 5'))
 @click.argument('bag', type=BAG)
-@click.option(
-    '-r',
-    '--rate',
-    type=click.FloatRange(min=0.0, min_open=True),
-    default=1.0,
-    show_default=True,
-    help='Speed: 2 is twice as fast.',
-)
+@click.option('-r', '--rate', type=click.FloatRange(min=0.0, min_open=True), default=1.0,
+    show_default=True, help='Speed: 2 is twice as fast.')
 @click.option('-l', '--loop', is_flag=True, help='Start over at the end, until Ctrl-C.')
-@click.option(
-    '--start-offset',
-    type=click.FloatRange(min=0.0),
-    default=0.0,
-    metavar='SECONDS',
-    help='Skip so much of the recording.',
-)
-@click.option(
-    '--playback-duration',
-    type=float,
-    default=-1.0,
-    metavar='SECONDS',
-    help='Play so much of the recording; negative, the default: to its end.',
-)
-@click.option(
-    '-d',
-    '--delay',
-    type=click.FloatRange(min=0.0),
-    default=0.0,
-    metavar='SECONDS',
-    help='Wait before the first message.',
-)
-@click.option(
-    '-p', '--start-paused', is_flag=True, help='Wait for the service /sonar_imm_player/resume.'
-)
-@click.option(
-    '--clock',
-    type=click.FloatRange(min=0.0, min_open=True),
-    is_flag=False,
-    flag_value=40.0,
-    default=None,
-    metavar='[HZ]',
-    help='Publish /clock, at 40 Hz by default.',
-)
+@click.option('--start-offset', type=click.FloatRange(min=0.0), default=0.0, metavar='SECONDS',
+    help='Skip so much of the recording.')
+@click.option('--playback-duration', type=float, default=-1.0, metavar='SECONDS',
+    help='Play so much of the recording; negative, the default: to its end.')
+@click.option('-d', '--delay', type=click.FloatRange(min=0.0), default=0.0, metavar='SECONDS',
+    help='Wait before the first message.')
+@click.option('-p', '--start-paused', is_flag=True,
+    help='Wait for the service /sonar_imm_player/resume.')
+@click.option('--clock', type=click.FloatRange(min=0.0, min_open=True), is_flag=False,
+    flag_value=40.0, default=None, metavar='[HZ]', help='Publish /clock, at 40 Hz by default.')
 @click.option('--topics', multiple=True, metavar='TOPIC...', help='Only these topics.')
 @click.option('--exclude-topics', multiple=True, metavar='TOPIC...', help='Not these topics.')
-@click.option(
-    '--qos-profile-overrides-path',
-    'qos_file',
+@click.option('--qos-profile-overrides-path', 'qos_file',
     type=click.Path(path_type=Path, dir_okay=False, exists=True),
-    help='YAML file with history, depth, reliability and durability by topic.',
-)
-@click.option(
-    '-m',
-    '--remap',
-    'remaps',
-    multiple=True,
-    metavar='OLD:=NEW...',
-    help='Publish under other names.',
-)
-@click.option(
-    '--lockstep',
-    is_flag=False,
-    flag_value='auto',
-    default='',
-    metavar='[NODE]',
-    help='Send the next message only when NODE, by default the only one, has answered.',
-)
+    help='YAML file with history, depth, reliability and durability by topic.')
+@click.option('-m', '--remap', 'remaps', multiple=True, metavar='OLD:=NEW...',
+    help='Publish under other names.')
+@click.option('--lockstep', is_flag=False, flag_value='auto', default='', metavar='[NODE]',
+    help='Send the next message only when NODE, by default the only one, has answered.')
 def command(bag: Path, remaps: tuple[str, ...], qos_file: Path | None, **options: Any) -> None:
     """Publish the recording BAG to live nodes, byte for byte, stamps included.
 
@@ -143,6 +94,7 @@ def command(bag: Path, remaps: tuple[str, ...], qos_file: Path | None, **options
     say(f'{result.published} messages published')
     for problem in result.problems:
         say(f'  problem: {problem}')
+# fmt: on
 
 
 def _old_and_new(text: str) -> tuple[str, str]:

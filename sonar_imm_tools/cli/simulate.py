@@ -20,51 +20,32 @@ from msg_adapters.inputs import FEEDERS
 from sonar_imm import __version__
 from sonar_imm.trackers import SYSTEMS
 
-from .common import example, json_option, print_json, say, set_option, typed_overrides
+from .common import by_topic, example, json_option, print_json, say, set_option, typed_overrides
 
 SURVEY, SURVEY_SCENES = 'survey', 'sonar_imm_tools.simulation.survey'
 """Not a system: lines of soundings over one floor."""
 
 
+# fmt: off
 @click.command(
-    epilog=example(
-        'sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
+    epilog=example('sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
         'sonar-imm simulate diver --list',
-        'sonar-imm simulate survey out --soundings --set lines=5',
-    )
-)
+        'sonar-imm simulate survey out --soundings --set lines=5'))
 @click.argument('system', type=click.Choice([*SYSTEMS, SURVEY]))
 @click.argument('out_bag', type=click.Path(path_type=Path), required=False)
 @click.option('--scenario', default=None, help='Name of the scene; by default the first one.')
-@click.option(
-    '--seed',
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help='The same scenario and seed give the same bag.',
-)
+@click.option('--seed', type=click.IntRange(min=0), default=0, show_default=True,
+    help='The same scenario and seed give the same bag.')
 @set_option
-@click.option(
-    '--soundings', is_flag=True, help='survey: folders of soundings, as `survey` reads them.'
-)
+@click.option('--soundings', is_flag=True,
+    help='survey: folders of soundings, as `survey` reads them.')
 @click.option('--compress', is_flag=True, help='Compress the bag: pressure takes a third.')
-@click.option(
-    '--list',
-    'list_scenarios',
-    is_flag=True,
-    help='Only list scenarios and what --set can change.',
-)
+@click.option('--list', 'list_scenarios', is_flag=True,
+    help='Only list scenarios and what --set can change.')
 @json_option
 def command(
-    system: str,
-    out_bag: Path | None,
-    scenario: str | None,
-    seed: int,
-    overrides: dict[str, str],
-    soundings: bool,
-    compress: bool,
-    list_scenarios: bool,
-    as_json: bool,
+    system: str, out_bag: Path | None, scenario: str | None, seed: int, overrides: dict[str, str],
+    soundings: bool, compress: bool, list_scenarios: bool, as_json: bool,
 ) -> None:
     """Write a bag of simulated measurements with their truth to OUT_BAG.
 
@@ -85,7 +66,7 @@ def command(
     from sonar_imm.truth import TrueTrack
 
     from ..recordings.own_files import own_parameters, unusual
-    from ..recordings.scenes import write_scene
+    from ..recordings.truth import write_scene
 
     name = scenario or next(iter(scenes.SCENARIOS))
     config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
@@ -120,10 +101,11 @@ def command(
     if as_json:
         print_json(result)
         return
-    what = ', '.join(f'{count} on {topic}' for topic, count in sorted(report.messages.items()))
+    what = by_topic(report.messages)
     say(f'{out_bag}: {what} ({name}, seed {seed}' + (f', {targets} targets)' if targets else ')'))
     if parameters:
         say(f'  parameters of the instruments, for the tracker: {parameters}')
+# fmt: on
 
 
 def _simulate_survey(
@@ -141,8 +123,8 @@ def _simulate_survey(
 
     from ..recordings.export.points import write_table
     from ..recordings.own_files import unusual
-    from ..recordings.scenes import write_scene
     from ..recordings.sources import BagError
+    from ..recordings.truth import write_scene
 
     name = scenario or next(iter(scenes.SCENARIOS))
     config = scenes.scenario(name, typed_overrides(scenes.SurveyScenario, overrides))

@@ -17,7 +17,17 @@ from pathlib import Path
 import click
 
 from ..evaluation.numbers import counted
-from .common import example, json_option, place_options, print_json, progress, say, warn
+from .common import (
+    crs_option,
+    example,
+    jobs_option,
+    json_option,
+    origin_option,
+    print_json,
+    progress,
+    say,
+    warn,
+)
 
 
 def _resolution(_ctx: click.Context, _param: click.Parameter, value: str) -> float:
@@ -32,51 +42,30 @@ def _resolution(_ctx: click.Context, _param: click.Parameter, value: str) -> flo
     return cell
 
 
+# fmt: off
 @click.command(
-    epilog=example(
-        'sonar-imm survey runs chart --adjust --crs 32632 --origin 500000,6000000',
+    epilog=example('sonar-imm survey runs chart --adjust --crs 32632 --origin 500000,6000000',
         'sonar-imm survey runs chart --adjust --jobs 8 --resume',
-        'sonar-imm survey runs chart --resolution 0.5 --scheduler tcp://10.0.0.5:8786',
-    )
-)
+        'sonar-imm survey runs chart --resolution 0.5 --scheduler tcp://10.0.0.5:8786'))
 @click.argument('runs', type=click.Path(path_type=Path))
 @click.argument('out', type=click.Path(path_type=Path))
-@click.option(
-    '--resolution',
-    default='auto',
-    show_default=True,
-    callback=_resolution,
-    metavar='auto|M',
-    help='Side of the cells in metres; auto: a twentieth of the depth, by tile.',
-)
+@click.option('--resolution', default='auto', show_default=True, callback=_resolution,
+    metavar='auto|M', help='Side of the cells in metres; auto: a twentieth of the depth, by tile.')
 @click.option('--adjust', 'adjusted', is_flag=True, help='Adjust the lines where they cross.')
 @click.option('--fix', 'fixed', metavar='LINE', multiple=True, help='A line whose tide is known.')
-@place_options
-@click.option(
-    '--jobs', type=click.IntRange(min=1), default=1, show_default=True, help='Processes.'
-)
-@click.option(
-    '--scheduler',
-    metavar='ADDRESS',
+@crs_option
+@origin_option
+@jobs_option(help='Processes.')
+@click.option('--scheduler', metavar='ADDRESS',
     help='Do the jobs on the cluster of this dask scheduler instead; its workers need the same '
-    'sonar_imm, and reach RUNS and OUT by the same paths.',
-)
+    'sonar_imm, and reach RUNS and OUT by the same paths.')
 @click.option('--resume', is_flag=True, help='Keep in OUT what is the same as before.')
 @click.option('--overwrite', is_flag=True, help='Replace OUT.')
 @json_option
 def command(
-    runs: Path,
-    out: Path,
-    resolution: float,
-    adjusted: bool,
-    fixed: tuple[str, ...],
-    epsg: int | None,
-    origin: tuple[float, float, float],
-    jobs: int,
-    scheduler: str | None,
-    resume: bool,
-    overwrite: bool,
-    as_json: bool,
+    runs: Path, out: Path, resolution: float, adjusted: bool, fixed: tuple[str, ...],
+    epsg: int | None, origin: tuple[float, float, float], jobs: int, scheduler: str | None,
+    resume: bool, overwrite: bool, as_json: bool,
 ) -> None:
     """Make one chart of all lines below RUNS, in the folder OUT.
 
@@ -110,20 +99,13 @@ def command(
         frame=frame_of(sources),
     )
     with folder_of(out, options, runs, resume=resume, overwrite=overwrite) as place:
-        with (
-            contextlib.ExitStack() as stack,
-            workers(jobs, scheduler, warn) as run,
-        ):
+        with contextlib.ExitStack() as stack, workers(jobs, scheduler, warn) as run:
 
             def begin(what: str, total: int) -> Callable[[int], None]:
                 stack.close()
                 return stack.enter_context(progress(what, total, quiet=as_json))
 
-            hooks = Progress(
-                begin=begin,
-                say=lambda text: say(text, quiet=as_json),
-                warn=warn,
-            )
+            hooks = Progress(begin=begin, say=lambda text: say(text, quiet=as_json), warn=warn)
             survey = make(sources, place, options, run, hooks)
         content = write(survey, place)
     failed = [line for line in content['lines'] if line['failure']]
@@ -133,3 +115,4 @@ def command(
         lines = len(content['lines']) - len(failed)
         left = f', {counted(len(failed), "line")} left out' if failed else ''
         say(f'{out}: {counted(lines, "line")} in {counted(len(content["tiles"]), "tile")}{left}')
+# fmt: on

@@ -24,6 +24,7 @@ from sonar_imm.trackers import System, SYSTEMS
 from .common import (
     BAG,
     example,
+    jobs_option,
     json_option,
     load_config,
     load_detector,
@@ -60,86 +61,49 @@ def _shard(
     raise click.BadParameter(f"'{value}' is not of the form I/N with 1 <= I <= N")
 
 
+# fmt: off
 @click.command(
-    epilog=example(
-        'sonar-imm track dive.bag out',
+    epilog=example('sonar-imm track dive.bag out',
         'sonar-imm track dive.bag out --set model_set=heading_speed',
         'sonar-imm track dive.bag out --topic fix=/usbl/pose --params my_diver.yaml',
         'sonar-imm track line1.bag line2.bag line3.bag out --jobs 3 --parquet',
         'sonar-imm track /survey/*.bag /survey/out --scheduler tcp://10.0.0.5:8786',
-        'sonar-imm track /survey/*.bag /survey/out '
-        '--shard $SLURM_ARRAY_TASK_ID/$SLURM_ARRAY_TASK_COUNT',
-    )
-)
+        'sonar-imm track /survey/*.bag /survey/out --shard '
+        '$SLURM_ARRAY_TASK_ID/$SLURM_ARRAY_TASK_COUNT'))
 @click.argument('bags', metavar='BAG...', nargs=-1, type=BAG)
 @click.argument('out_dir', metavar='OUT_DIR', required=False, type=click.Path(path_type=Path))
 @system_option
 @params_option('Parameter file: ROS 2 form or a plain mapping.')
 @set_option
 @topic_option
-@click.option(
-    '--order',
-    type=click.Choice(['recorded', 'stamp']),
-    default='recorded',
-    show_default=True,
-    help='Messages in the order of arrival, or sorted by their stamps.',
-)
-@click.option(
-    '--sound-speed',
-    type=click.Path(path_type=Path),
-    metavar='FILE',
+@click.option('--order', type=click.Choice(['recorded', 'stamp']), default='recorded',
+    show_default=True, help='Messages in the order of arrival, or sorted by their stamps.')
+@click.option('--sound-speed', type=click.Path(path_type=Path), metavar='FILE',
     help='Profile of sound speed (CARIS .svp, Kongsberg .asvp, Sea-Bird .cnv, CSV): rays of '
-    'bathymetry bend by it, other systems take its mean.',
-)
-@click.option(
-    '--initial',
-    metavar='FILE',
-    type=click.Path(path_type=Path),
+    'bathymetry bend by it, other systems take its mean.')
+@click.option('--initial', metavar='FILE', type=click.Path(path_type=Path),
     help='Where divers are at first, as the topic initial says it: YAML or JSON with position and '
-    'covariance, and if wanted name, time, frame_id.',
-)
+    'covariance, and if wanted name, time, frame_id.')
 @click.option('--smooth', is_flag=True, help='Condition each estimate on later measurements too.')
-@click.option(
-    '--jobs',
-    type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
+@jobs_option(
     help='Processes: for several runs, or for the pings of one where no ping needs another '
-    '(bathymetry). The estimates do not depend on it.',
-)
-@click.option(
-    '--scheduler',
-    metavar='ADDRESS',
+    '(bathymetry). The estimates do not depend on it.')
+@click.option('--scheduler', metavar='ADDRESS',
     help='Do the runs on the cluster of this dask scheduler instead; its workers need the same '
-    'sonar_imm, and reach BAG and OUT_DIR by the same paths.',
-)
-@click.option(
-    '--shard',
-    metavar='I/N',
-    callback=_shard,
+    'sonar_imm, and reach BAG and OUT_DIR by the same paths.')
+@click.option('--shard', metavar='I/N', callback=_shard,
     help='Only the I-th share of N of the bags, in the order of their paths: every N-th from the '
-    'I-th, as one of N commands that know nothing of each other, such as a Slurm array.',
-)
-@click.option(
-    '--parquet',
-    is_flag=True,
+    'I-th, as one of N commands that know nothing of each other, such as a Slurm array.')
+@click.option('--parquet', is_flag=True,
     help='Write the tables as Parquet in place of CSV, a fifth of the bytes, and bins that have '
-    'soundings into the table alone; needs pyarrow.',
-)
+    'soundings into the table alone; needs pyarrow.')
 @click.option('--no-table', is_flag=True, help='Write no tables: the bag has all of it.')
 @click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')
 @click.option('--strict', is_flag=True, help='Stop at the first damage in BAG.')
 @json_option
 def command(
-    bags: tuple[Path, ...],
-    out_dir: Path | None,
-    jobs: int,
-    scheduler: str | None,
-    shard: tuple[int, int] | None,
-    parquet: bool,
-    no_table: bool,
-    as_json: bool,
-    **options: Any,
+    bags: tuple[Path, ...], out_dir: Path | None, jobs: int, scheduler: str | None,
+    shard: tuple[int, int] | None, parquet: bool, no_table: bool, as_json: bool, **options: Any,
 ) -> None:
     """Track the recording BAG offline and write the estimates to OUT_DIR.
 
@@ -189,6 +153,7 @@ def command(
         runs, failures = _of_all(plan, bags, out_dir, shard or (1, 1))
     summary = SUMMARY if shard is None else SHARD_SUMMARY.format(*shard)
     _track_all(runs, failures, out_dir, summary, jobs, scheduler, as_json)
+# fmt: on
 
 
 @frozen(kw_only=True)
@@ -250,7 +215,8 @@ class Plan:
         from ..recordings.reader import BagReader
         from ..recordings.topics import instruments, remarks_on_topics
 
-        wanted = inputs_by_topic(self.topics)
+        # Input by topic name; None to choose by name.
+        wanted = {topic: name for name, topic in self.topics.items()} or None
         with BagReader(bag, strict=self.strict) as reader:
             system = choose_system(reader, self.system, wanted)
             found = instruments(reader, system.name, wanted)
@@ -370,11 +336,6 @@ def _track_all(
     print_json(content) if as_json else _print_summary(content, out_dir)
     if any(outcome.failure for outcome in outcomes):
         raise click.exceptions.Exit(1)
-
-
-def inputs_by_topic(topics: dict[str, str]) -> dict[str, str] | None:
-    """``--topic`` as `recordings` takes it: input by topic name, None to choose by name."""
-    return {topic: name for name, topic in topics.items()} or None
 
 
 def choose_system(

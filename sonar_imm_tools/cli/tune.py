@@ -21,6 +21,7 @@ import click
 from .common import (
     BAG,
     example,
+    jobs_option,
     json_option,
     params_option,
     print_json,
@@ -36,43 +37,25 @@ if TYPE_CHECKING:
     from ..evaluation.tuning import Fitting
 
 
+# fmt: off
 @click.command(
-    epilog=example(
-        'sonar-imm tune dive.bag --system diver',
+    epilog=example('sonar-imm tune dive.bag --system diver',
         'sonar-imm tune dive1.bag dive2.bag --out tuned.yaml --jobs 2',
         'sonar-imm tune survey.bag --parameters range_std,detection_probability --json',
-        'sonar-imm track dive.bag out --params tuned.yaml',
-    )
-)
+        'sonar-imm track dive.bag out --params tuned.yaml'))
 @click.argument('bags', metavar='BAG...', nargs=-1, required=True, type=BAG)
 @system_option
-@click.option(
-    '--parameters',
-    metavar='NAME,...',
-    help='Parameters to fit; default: those that bags of the system can determine.',
-)
-@click.option(
-    '--out',
-    type=click.Path(path_type=Path, dir_okay=False),
-    help='Write the parameters here, for `track --params` and the nodes.',
-)
+@click.option('--parameters', metavar='NAME,...',
+    help='Parameters to fit; default: those that bags of the system can determine.')
+@click.option('--out', type=click.Path(path_type=Path, dir_okay=False),
+    help='Write the parameters here, for `track --params` and the nodes.')
 @params_option('Parameter file to begin with: ROS 2 form or a plain mapping.')
 @set_option
 @topic_option
-@click.option(
-    '--jobs',
-    type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
-    help='Processes that share the fits. The result does not depend on it.',
-)
+@jobs_option(help='Processes that share the fits. The result does not depend on it.')
 @json_option
 def command(
-    bags: tuple[Path, ...],
-    parameters: str | None,
-    out: Path | None,
-    jobs: int,
-    as_json: bool,
+    bags: tuple[Path, ...], parameters: str | None, out: Path | None, jobs: int, as_json: bool,
     **options: Any,
 ) -> None:
     """Fit parameters to your own bags, by how well the tracker predicts each measurement from the
@@ -140,6 +123,7 @@ def command(
         say(f'{data} not determine any of the parameters; {rest}')
     elif out is not None:
         say(f'written to {out}')
+# fmt: on
 
 
 def _configured(fitting: Fitting) -> dict[str, Any]:

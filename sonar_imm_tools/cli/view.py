@@ -21,21 +21,15 @@ import click
 from .common import BAG, example, Renewed, say
 
 
-@click.command(
-    cls=Renewed,
-    epilog=example(
-        'sonar-imm view out', 'sonar-imm view dive.bag', 'sonar-imm view out --rerun out.rrd'
-    ),
-)
+# fmt: off
+@click.command(cls=Renewed,
+    epilog=example('sonar-imm view out', 'sonar-imm view dive.bag',
+        'sonar-imm view out --rerun out.rrd'))
 @click.argument('source', metavar='RESULTS|BAG', type=BAG)
 @click.option('--browser', is_flag=True, hidden=True, expose_value=False)  # the only way now
-@click.option(
-    '--rerun',
-    'rerun_file',
-    metavar='FILE.rrd',
+@click.option('--rerun', 'rerun_file', metavar='FILE.rrd',
     type=click.Path(path_type=Path, dir_okay=False),
-    help='Write the estimates of RESULTS for the Rerun viewer instead.',
-)
+    help='Write the estimates of RESULTS for the Rerun viewer instead.')
 def command(source: Path, rerun_file: Path | None) -> None:
     """Open the HTML report of RESULTS, a folder of `sonar-imm track`, in the browser.
 
@@ -51,6 +45,7 @@ def command(source: Path, rerun_file: Path | None) -> None:
     RunFolder(source).keep_from(rerun_file)
     count = write_rerun(source, rerun_file)
     say(f'{count} estimates written to {rerun_file}; show them with: rerun {rerun_file}')
+# fmt: on
 
 
 def _open_report(source: Path) -> None:

@@ -19,10 +19,9 @@ from sonar_imm.trackers import SYSTEMS
 from .common import example, load_config, params_option, Renewed, say, set_option
 
 
-@click.command(
-    cls=Renewed,
-    epilog=example('sonar-imm warm', 'sonar-imm warm fathometer --set heave=memory'),
-)
+# fmt: off
+@click.command(cls=Renewed,
+    epilog=example('sonar-imm warm', 'sonar-imm warm fathometer --set heave=memory'))
 @click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
 @params_option('ROS 2 parameter file of the tracker; with exactly one system.')
 @set_option
@@ -39,3 +38,4 @@ def command(systems: tuple[str, ...], params: Path | None, overrides: dict[str, 
         system = SYSTEMS[name]
         tracker = system.build(load_config(system, params, overrides)[0])
         say(f'{name}: {system.warm(tracker) or "nothing to compile"}')
+# fmt: on

@@ -8,12 +8,4 @@
 
 """Runs of recordings: tracked offline, scored against truth, shown in a report, timed."""
 
-__all__ = [
-    'columns',
-    'judging',
-    'numbers',
-    'plotting',
-    'report',
-    'rerun_file',
-    'tuning',
-]
+__all__ = ['columns', 'judging', 'numbers', 'plotting', 'report', 'rerun_file', 'tuning']

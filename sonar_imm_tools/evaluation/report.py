@@ -40,8 +40,7 @@ from sonar_imm.texts import visible
 
 from ..recordings.sources import BagError
 from .numbers import Card, Check, counted, flatten, front
-from .plotting import plain_content
-from .thumbnails import thumbnail
+from .plotting import plain_content, thumbnail
 
 LEAST_GL_POINTS = 2000
 MOST_GL_FIGURES = 4
@@ -176,7 +175,7 @@ def report_html(part: Part, front_page: str = '') -> str:
     """The page of a run as text; the same part gives the same bytes. front_page: where the front
     page of several is, which share plotly.js; without one it is inside the page."""
     figures = [section.figure for section in part.sections if section.figure is not None]
-    return _rendered(
+    return rendered(
         'report.html',
         part=part,
         front_page=quote(front_page),
@@ -188,7 +187,7 @@ def report_html(part: Part, front_page: str = '') -> str:
 def front_html(parts: Sequence[Part], links: Sequence[str]) -> str:
     """The front page of several runs, a row for each, with the address of its page."""
     rows = [(part, quote(link), front(part.cards)) for part, link in zip(parts, links)]
-    return _rendered('front.html', rows=rows, pictures=_pictures(parts, links))
+    return rendered('front.html', rows=rows, pictures=_pictures(parts, links))
 
 
 def _pictures(parts: Sequence[Part], links: Sequence[str]) -> list[tuple[Part, str, str]]:
@@ -201,7 +200,8 @@ def _pictures(parts: Sequence[Part], links: Sequence[str]) -> list[tuple[Part, s
     return [(part, quote(link), thumbnail(picture)) for part, link, picture in best.values()]
 
 
-def _rendered(template: str, **values: Any) -> str:
+def rendered(template: str, **values: Any) -> str:
+    """A page as text; template: of the folder ``templates``."""
     pages = Environment(
         loader=FileSystemLoader(Path(__file__).with_name('templates')),
         autoescape=True,

@@ -443,12 +443,9 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
         free = np.flatnonzero(~at_bound)
 
         def evaluate(points: list[FloatArray]) -> list[float]:
-            wide = []
-            for point in points:
-                whole = best.copy()
-                whole[free] = point
-                wide.append((fitting, whole, WHOLE))
-            return together(_posterior, wide)
+            wide = np.tile(best, (len(points), 1))
+            wide[:, free] = points
+            return together(fitting.posterior, [(point,) for point in wide])
 
         part = evolve(fitting, tunables=tuple(tunables[k] for k in free))
         se[free] = errors(part, best[free], evaluate)
@@ -466,7 +463,7 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
             used += evaluations
         written = [t.coordinate(rounded(t.value(u))) for t, u in zip(again.tunables, final[kept])]
         chosen = np.array(written)
-        (after,) = together(_score, [(again, chosen, WHOLE)])
+        ((after, _),) = together(again.scores, [(chosen,)])
         used += 1
         values = _as_written(values_of(again.tunables, chosen))
     rows = []
@@ -531,9 +528,9 @@ def _supported(
         calls = []
         for (u, _, _), other in zip(fits, (SECOND, FIRST)):
             without = np.where(np.eye(len(kept), dtype=bool), start[kept], u)
-            calls += [(part, each, other) for each in (u, None, *without)]
+            calls += [(each, other) for each in (u, None, *without)]
         used += sum(found[2] for found in fits) + len(calls)
-        scores = np.reshape(together(_score, calls), (2, -1))
+        scores = np.reshape([score for score, _ in together(part.scores, calls)], (2, -1))
         gain, *each = (math.fsum([*scores[:, 0], *-column]) for column in scores[:, 1:].T)
         gains.update(zip(kept.tolist(), each))
         weakest = int(np.argmin(each))
@@ -550,27 +547,21 @@ def _as_written(values: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _posterior(
-    fitting: Fitting, u: FloatArray, part: str, advance: Callable[[int], None] | None = None
-) -> float:
-    if advance is not None:
-        advance(1)
-    return fitting.posterior(u, part)
-
-
-def _score(
-    fitting: Fitting, u: FloatArray | None, part: str, advance: Callable[[int], None] | None = None
-) -> float:
-    if advance is not None:
-        advance(1)
-    return fitting.scores(u, part)[0]
-
-
 @contextlib.contextmanager
 def _mapping(count: int, advance: Callable[[int], None]) -> Iterator[Together]:
     """Calls of a function with each of some arguments, here or in `count` processes."""
+
+    def here(work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> list[Any]:
+        if work is maximise:  # which takes so long that it tells of each evaluation
+            return [work(*call, advance) for call in calls]
+        results = []
+        for call in calls:
+            results.append(work(*call))
+            advance(1)
+        return results
+
     if count == 1:
-        yield lambda work, calls: [work(*call, advance) for call in calls]
+        yield here
         return
     with processes(count) as pool:
 

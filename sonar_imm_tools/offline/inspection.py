@@ -19,14 +19,21 @@ from attrs import define, field
 import numpy as np
 
 from msg_adapters.headers import stamp_ns
-from msg_adapters.inputs import inputs_of, InputTopic, made_inputs, needed
+from msg_adapters.inputs import inputs_of, InputTopic
 from sonar_imm.measurements import Fix, GeodeticFix, Rejection
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.polling import BEFORE, turn_of
 
 from .. import SECOND
 from ..recordings.reader import BagMessage, BagReader, TopicInfo
-from ..recordings.topics import fed, fitting_systems, instruments
+from ..recordings.topics import (
+    every_input,
+    fed,
+    fitting_systems,
+    instruments,
+    is_truth,
+    needed_inputs,
+)
 
 MOST_FIXES = 1000
 """Fixes of a topic by which it is told whether each has a stamp of its own."""
@@ -94,7 +101,11 @@ def _look_at(item: BagMessage, found: _Found, detector: Mapping[str, Any]) -> No
     header = getattr(item.message, 'header', None)
     if header is not None:
         found.frames[str(header.frame_id)] += 1
-        if stamp := _usable_stamp(item.message):
+        try:
+            stamp = stamp_ns(item.message)
+        except Rejection:
+            stamp = 0
+        if stamp > 0:
             found.stamps.append(stamp)
         else:
             found.no_stamp += 1
@@ -115,33 +126,19 @@ def _look_at(item: BagMessage, found: _Found, detector: Mapping[str, Any]) -> No
                 found.missing[system] = rejection.missing
 
 
-def _usable_stamp(message: Any) -> int | None:
-    try:
-        stamp = stamp_ns(message)
-    except Rejection:
-        return None
-    return stamp if stamp > 0 else None
-
-
 def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
     """The tracker inputs that a message could be for. Truth is no input."""
-    if _is_truth(item.topic):
+    if is_truth(item.topic):
         return []
     found = []
     for system in SYSTEMS:
         fitting = [
-            entry
-            for entry in (*inputs_of(system), *made_inputs(system))
-            if entry.may_be(item.topic, item.type_name)
+            entry for entry in every_input(system) if entry.may_be(item.topic, item.type_name)
         ]
         # Of several inputs that a name says, the later one counts, as in `fitting_topics`.
         named = [entry for entry in fitting if entry.is_named(item.topic)][-1:]
         found += [(system, entry) for entry in named or fitting]
     return found
-
-
-def _is_truth(topic: str) -> bool:
-    return 'truth' in topic.split('/')
 
 
 def _topic_entry(found: _Found) -> dict[str, Any]:
@@ -199,7 +196,7 @@ def _scans(found: _Found) -> dict[str, int] | None:
 
 def _holds_scans(found: _Found) -> bool:
     """Whether messages with equal stamps are one scan of several targets, not repetitions."""
-    return _is_truth(found.topic.name) or any(
+    return is_truth(found.topic.name) or any(
         entry.scans
         for system, name in found.good
         for entry in inputs_of(system)
@@ -294,13 +291,11 @@ def _systems(
 
 
 def _entry(system: str, name: str) -> InputTopic:
-    return next(
-        entry for entry in (*inputs_of(system), *made_inputs(system)) if entry.name == name
-    )
+    return next(entry for entry in every_input(system) if entry.name == name)
 
 
 def _enough(system: str, names: Collection[str]) -> bool:
     """Whether a tracker with the default parameters can do something with these inputs."""
     there = fed(_entry(system, name) for name in names)
-    required, one_of = needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())
+    required, one_of = needed_inputs(system)
     return there.issuperset(required) and (not one_of or not there.isdisjoint(one_of))

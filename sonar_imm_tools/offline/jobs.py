@@ -75,9 +75,7 @@ why nothing did."""
 
 @contextlib.contextmanager
 def workers(
-    count: int = 1,
-    address: str | None = None,
-    note: Callable[[str], None] = lambda sentence: None,
+    count: int = 1, address: str | None = None, note: Callable[[str], None] = lambda sentence: None
 ) -> Iterator[Run]:
     """What runs calls in this process, in `count` processes, or on a dask cluster.
 

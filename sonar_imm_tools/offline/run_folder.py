@@ -68,14 +68,8 @@ from ..recordings.reader import BagError, BagReader
 from ..recordings.truth import TRUTH_TOPIC
 from ..recordings.writer import BagWriter, naming, ros_message
 
-BAG, CSV, SOUNDINGS, RUN, METRICS, REPORT = (
-    'estimate',
-    'estimate.csv',
-    'soundings.csv',
-    'run.json',
-    'metrics.json',
-    'report.html',
-)
+BAG, CSV, SOUNDINGS = 'estimate', 'estimate.csv', 'soundings.csv'
+RUN, METRICS, REPORT = 'run.json', 'metrics.json', 'report.html'
 PARQUET = {CSV: 'estimate.parquet', SOUNDINGS: 'soundings.parquet'}
 """The same tables as Parquet."""
 AS_CSV, AS_PARQUET, NO_TABLE = 'csv', 'parquet', 'none'
@@ -232,7 +226,8 @@ class RunFolder:
         remove_leftovers(self.path)
         if self.path.exists() and not self.path.is_dir():
             raise BagError(f'{self.path} is a file; a folder is needed')
-        if (self.path / 'metadata.yaml').exists() or _is_any(self.path, inputs):
+        is_input = os.path.realpath(self.path) in map(os.path.realpath, inputs)
+        if (self.path / 'metadata.yaml').exists() or is_input:
             raise BagError(f'{self.path} is a recording; choose another folder for the run')
         old = [name for name in _RUN_FILES if os.path.lexists(self.path / name)]
         if old and not overwrite:
@@ -416,10 +411,6 @@ def read_json(path: Path) -> Any:
         raise BagError(f'{path} cannot be understood: {error}') from None
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from None
-
-
-def _is_any(path: Path, others: Iterable[Path]) -> bool:
-    return os.path.realpath(path) in map(os.path.realpath, others)
 
 
 def summaries(folder: Path) -> list[Path]:

@@ -260,16 +260,11 @@ class OfflineRun:
                 measurement = measurement.start(first_ns, self._names)
             admitted = self._intake.admit(measurement)
         except Rejection as rejection:
-            self._refuse(topic, rejection)
+            first = Refused(0, f'{topic}: {rejection.sentence}')
+            self.refused.setdefault(rejection.reason, first).count += 1
             return
         if admitted is not None:
             yield admitted
-
-    def _refuse(self, topic: str, rejection: Rejection) -> None:
-        entry = self.refused.setdefault(
-            rejection.reason, Refused(0, f'{topic}: {rejection.sentence}')
-        )
-        entry.count += 1
 
     def recipe(self) -> dict[str, Any]:
         """What decides about the estimates, and is known before: as run.json has it."""
@@ -304,41 +299,22 @@ class OfflineRun:
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts
 
-    def warnings(self) -> list[str]:
-        """What of the input cannot be true, as the tracker says it at the end."""
-        return list(getattr(self.tracker, 'warnings', list)())
-
-    def origin(self) -> dict[str, Any]:
-        """Where the frame of the tracks lies on Earth, as plain values; nothing when not known."""
+    def findings(self) -> dict[str, Any]:
+        """What only some runs have, as plain values: where the frame of the tracks lies on Earth;
+        the names of targets by target ID, as the parameter `tags` lists and the recording notes
+        them; where /tf_static says that the sonar is on its vehicle; the obstacles that are known
+        at the end; what the echoes show of the staves of an array."""
         origin = getattr(self.tracker, 'origin', None) or self.options.origin
-        return {} if origin is None else {'origin': asdict(origin)}
-
-    def target_names(self) -> dict[str, Any]:
-        """The names of targets by target ID, as the parameter `tags` lists and the recording notes
-        them; nothing where there are none."""
         tags = tag_numbers(getattr(self.tracker.config, 'tags', ()))
         names = {str(number): tag for tag, number in tags.items() if tag != str(number)}
-        names |= self.bag.target_names
-        return {TARGET_NAMES: names} if names else {}
-
-    def landmarks(self) -> dict[str, Any]:
-        """The obstacles that are known at the end; nothing of a tracker that keeps none."""
-        known = getattr(self.tracker, 'known', None)
-        return {} if known is None else {'landmarks': known()}
-
-    def array(self) -> dict[str, Any]:
-        """What the echoes show of the staves of an array; nothing of other sensors, or of too few
-        pings."""
-        found: dict[str, Any] = getattr(self.tracker, 'array', dict)()
-        return {'array': found} if found else {}
-
-    def mounting(self) -> dict[str, Any]:
-        """Where /tf_static says that the sonar is on its vehicle; nothing where it does not."""
-        return {'mounting': self._intake.mounting} if self._intake.mounting else {}
-
-    def refusals(self) -> dict[str, dict[str, Any]]:
-        """Count and example by reason, as plain values."""
-        return {reason: asdict(entry) for reason, entry in sorted(self.refused.items())}
+        found = {
+            'origin': None if origin is None else asdict(origin),
+            TARGET_NAMES: names | self.bag.target_names or None,
+            'mounting': self._intake.mounting or None,
+            'landmarks': getattr(self.tracker, 'known', lambda: None)(),
+            'array': getattr(self.tracker, 'array', dict)() or None,
+        }
+        return {name: value for name, value in found.items() if value is not None}
 
     def failure(self) -> str:
         """Why nothing came of the recording, when all of it was refused; else nothing."""
@@ -406,14 +382,10 @@ def write_run(
         **written,
         written_bytes=sum(f.stat().st_size for f in folder.path.rglob('*') if f.is_file()),
         counts=offline.outcomes(),
-        refused=offline.refusals(),
-        warnings=offline.warnings(),
+        refused={reason: asdict(entry) for reason, entry in sorted(offline.refused.items())},
+        warnings=list(getattr(offline.tracker, 'warnings', list)()),
         problems=list(offline.bag.problems),
-        **offline.origin(),
-        **offline.target_names(),
-        **offline.mounting(),
-        **offline.landmarks(),
-        **offline.array(),
+        **offline.findings(),
         timings={
             'wall_s': seconds,
             'mb_per_s': recipe['bag_bytes'] / seconds * 1e-6,

@@ -22,7 +22,6 @@ __all__ = [
     'places',
     'positions',
     'reader',
-    'scenes',
     'sniffing',
     'sources',
     'topics',

@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import functools
 import json
@@ -23,14 +23,12 @@ from typing import Any, TypeVar
 from attrs import define, Factory
 import numpy as np
 
-from msg_adapters.inputs import InputTopic
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.intake.leaps import FASTEST, NEAR
 from sonar_imm.measurements import Rejection, VesselFix
 
 from .. import SECOND
-from .messages import cdr_of, ros_message
-from .reader import BagMessage, BagReader
+from .messages import cdr_of
 from .sources import BagError, TARGET_NAMES
 from .tables import Row, Table
 from .times import BadRow
@@ -88,6 +86,14 @@ class ConversionReport:
             self.problems.append(f'{path.name}, {where}: {why}')
         elif self.bad_rows == MOST_NAMED + 1:
             self.problems.append('further bad rows are counted but not listed')
+
+    @contextmanager
+    def leaving_out(self, path: Path, where: str) -> Iterator[None]:
+        """Count a record as a bad row where it is rejected within."""
+        try:
+            yield
+        except (BadRow, Rejection) as error:
+            self.bad_row(path, where, error)
 
     def note_ignored(self, path: Path, arrays: Sequence[str]) -> None:
         """Note which arrays of an archive were not used."""
@@ -247,24 +253,23 @@ def _wrong_stamps(
 
 
 def write_bag(
-    out: str | Path,
-    records: Iterable[Record],
     report: ConversionReport,
-    *,
-    source: str,
-    storage: str = 'mcap',
+    records: Iterable[Record],
+    path: Path,
+    how: Any,
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     streams: Mapping[str, Sequence[int]] | None = None,
     needed: str = '',
-) -> ConversionReport:
-    """Write `records` in time order into a new bag at `out`; log time = stamp. Those whose clock
-    is off for itself are left out and counted.
+) -> None:
+    """Write `records` of the file `path` in time order into the bag of `report`; log time = stamp.
+    Those whose clock is off for itself are left out and counted.
 
-    parameters: those of its instruments, by the names of nodes; streams: stamps in the order in
-    which each clock of the file said them, by default those of each topic; needed: a topic without
-    which the others are of no use. Raises `BagError` when there is nothing to write or the bag
-    cannot be made.
+    how: options of the conversion; parameters: those of the instruments, by the names of nodes;
+    streams: stamps in the order in which each clock of the file said them, by default those of
+    each topic; needed: a topic without which the others are of no use. Raises `BagError` when
+    there is nothing to write or the bag cannot be made.
     """
+    source = path.name
     # Bytes take less room than messages.
     packed = [
         (stamp, topic, message.__msgtype__, cdr_of(message)) for stamp, topic, message in records
@@ -282,62 +287,14 @@ def write_bag(
     notes = provenance(source, report.notes)
     if named := {str(number): name for name, number in report.target_names.items()}:
         notes[TARGET_NAMES] = json.dumps(named, ensure_ascii=False)
-    with BagWriter(out, storage=storage, custom_data=notes, parameters=parameters) as bag:
+    with BagWriter(
+        report.path, storage=how.storage, custom_data=notes, parameters=parameters
+    ) as bag:
         for stamp_ns, topic, kind, raw in ordered:
             bag.write_raw(topic, kind, raw, stamp_ns)
             report.messages[topic] += 1
-    return report
 
 
 def provenance(source: str, notes: Mapping[str, str]) -> dict[str, str]:
     """What a converted bag notes beside its messages."""
     return {'source': source, 'converted_by': 'sonar-imm convert', **notes}
-
-
-def write_from_bag(
-    out: str | Path,
-    bag: BagReader,
-    topics: Collection[str],
-    make: Callable[[BagMessage], tuple[str, Any] | None],
-    report: ConversionReport,
-    *,
-    storage: str,
-) -> None:
-    """Write a new bag at `out` of messages of another one, in recorded order and with their times.
-
-    make: topic and message for a message of `bag`, or None where there is none yet; messages for
-    which it raises `Rejection` are counted and named.
-    """
-    notes = provenance(bag.path.name, report.notes)
-    with BagWriter(out, storage=storage, custom_data=notes) as made:
-        for item in bag.messages(topics):
-            report.rows += 1
-            try:
-                written = make(item)
-            except Rejection as rejection:
-                report.bad_row(bag.path, f'{item.topic} #{item.index}', rejection)
-                continue
-            if written is not None:
-                topic, message = written
-                made.write(topic, message, item.log_ns)
-                report.messages[topic] += 1
-
-
-def companion_topics(bag: BagReader, wanted: Mapping[str, InputTopic]) -> dict[str, str]:
-    """Inputs that a tracker needs beside what is converted, such as navigation: input name by
-    topic, for the first topic of `bag` of each kind in `wanted`."""
-    chosen = {}
-    for name, entry in wanted.items():
-        fitting = [topic.name for topic in bag.topics if topic.type_name in entry.readers]
-        if fitting:
-            chosen[fitting[0]] = name
-    return chosen
-
-
-def copied(entry: InputTopic, type_name: str, message: Any) -> Any:
-    """The message of a bag as our own. Raises `Rejection`."""
-    # A frame that calls itself NED is turned into ENU; others stay as they are, and whoever tracks
-    # the new bag states their convention.
-    ned = str(message.header.frame_id).endswith('_ned')
-    measurement = entry.readers[type_name](message, world_frame='ned' if ned else 'enu')
-    return entry.write(measurement, ros_message)

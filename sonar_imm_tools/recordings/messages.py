@@ -19,15 +19,11 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
+_BITS = (8, 16, 32, 64)
 _DTYPES = {
-    **dict.fromkeys(('octet', 'byte', 'char'), np.uint8),
-    'bool': np.bool_,
-    **{
-        f'{kind}{bits}': getattr(np, f'{kind}{bits}')
-        for kind in ('int', 'uint')
-        for bits in (8, 16, 32, 64)
-    },
-    **{'float32': np.float32, 'float64': np.float64},
+    **dict.fromkeys(('octet', 'byte', 'char'), np.dtype(np.uint8)),
+    **{name: np.dtype(name) for name in ('bool', 'float32', 'float64')},
+    **{f'{kind}{bits}': np.dtype(f'{kind}{bits}') for kind in ('int', 'uint') for bits in _BITS},
 }
 _SCALARS = {
     name: bool if name == 'bool' else float if name.startswith('float') else int

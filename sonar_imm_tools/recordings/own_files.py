@@ -43,12 +43,7 @@ PARAMETERS = 'parameters.yaml'
 LIMIT = 'check.yaml'
 MOST_BYTES = 1_000_000
 """Bytes of a file that the parameters of a recording name."""
-OF_FRAMES = (
-    'frame_id',
-    'world_frame_convention',
-    'origin',
-    'input_types',
-)
+OF_FRAMES = ('frame_id', 'world_frame_convention', 'origin', 'input_types')
 """Parameters of a node that a recording may state: in what frames it was measured, and of which
 types its messages are."""
 _HEADS = {

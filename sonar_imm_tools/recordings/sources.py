@@ -331,7 +331,11 @@ def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
             if not source.unordered:
                 return [source], leftovers(path)
             source.close()
-    files = sorted((file for file in path.iterdir() if file.suffix in SUFFIXES), key=_split_order)
+    # Of a split bag name_2 comes before name_10.
+    files = sorted(
+        (file for file in path.iterdir() if file.suffix in SUFFIXES),
+        key=lambda file: (len(file.name), file.name),
+    )
     if not files:
         if problems:
             raise BagError(problems[0])
@@ -353,7 +357,10 @@ def _open_files(files: list[Path], problems: list[str]) -> tuple[list[Source], l
         try:
             source, damage = _open_file(file)
         except Exception as error:  # see the module docstring
-            failures.append(f'{file} cannot be read: {one_line(error)}{advice(file)}')
+            sentence = f'{file} cannot be read: {one_line(error)}'
+            if file.suffix == '.db3':
+                sentence += f' (sqlite3 {file.name} .recover may save some of it)'
+            failures.append(sentence)
             continue
         sources.append(source)
         problems += damage + leftovers(file)
@@ -386,11 +393,6 @@ def _unpacked(raw: bytes) -> bytes:
         return unpack(raw, 'zstd')
     except (TooLargeError, zstd.ZstdError):
         return bytes(raw)
-
-
-def _split_order(file: Path) -> tuple[int, str]:
-    """Order the files of a split bag: name_2 comes before name_10."""
-    return len(file.name), file.name
 
 
 def _require_regular(path: Path) -> None:
@@ -470,10 +472,6 @@ def leftovers(path: Path) -> list[str]:
         for log in logs
         if log.exists() and log.stat().st_size
     ]
-
-
-def advice(file: Path) -> str:
-    return f' (sqlite3 {file.name} .recover may save some of it)' if file.suffix == '.db3' else ''
 
 
 def start_of(path: Path, size: int = 4096) -> bytes:

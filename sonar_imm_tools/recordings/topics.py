@@ -23,6 +23,27 @@ from .reader import BagReader
 from .sources import BagError, TopicInfo
 
 
+def every_input(system: str) -> tuple[InputTopic, ...]:
+    """The inputs of a tracker, and those of which a node before it makes one."""
+    return (*inputs_of(system), *made_inputs(system))
+
+
+def needed_inputs(system: str) -> tuple[Collection[str], Collection[str]]:
+    """The inputs that a tracker cannot do without by default: all of the first, one of the
+    second."""
+    return needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())
+
+
+def is_truth(topic: str) -> bool:
+    """Whether a topic holds truth, which is no input."""
+    return 'truth' in topic.split('/')
+
+
+def types_of(bag: BagReader) -> dict[str, str]:
+    """The type of each topic of a recording."""
+    return {topic.name: topic.type_name for topic in bag.topics}
+
+
 def fitting_topics(
     bag: BagReader, system: str, topics: Mapping[str, str] | None = None
 ) -> dict[str, InputTopic]:
@@ -107,7 +128,7 @@ def remarks_on_topics(
         ]
     used = {topic for inputs in found.values() for topic in inputs}
     for topic in bag.topics:
-        if topic.name in used or 'truth' in topic.name.split('/'):
+        if topic.name in used or is_truth(topic.name):
             continue
         entries = [entry for entry in inputs_of(system) if _can_read(topic, entry)]
         could = [e.name for e in entries if e.may_be(topic.name, topic.type_name)]
@@ -148,14 +169,14 @@ def system_in_mind(bag: BagReader) -> str:
     def could(system: str) -> tuple[bool, int, int]:
         entries = [
             entry
-            for entry in (*inputs_of(system), *made_inputs(system))
+            for entry in every_input(system)
             if not entry.companion
             and any(
-                entry.may_be(topic.name, topic.type_name) and 'truth' not in topic.name.split('/')
+                entry.may_be(topic.name, topic.type_name) and not is_truth(topic.name)
                 for topic in bag.topics
             )
         ]
-        required = needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())[0]
+        required = needed_inputs(system)[0]
         names = ' '.join(f'{topic.name} {topic.type_name}' for topic in bag.topics).lower()
         words = sum(word in names for word in SYSTEMS[system].words)
         return bool(entries) and fed(entries).issuperset(required), len(entries), words
@@ -175,9 +196,9 @@ def ready_systems(bag: BagReader) -> list[str]:
 def _evidence(
     bag: BagReader, system: str, fitting: Mapping[str, InputTopic]
 ) -> tuple[bool, bool, int]:
-    types = {topic.name: topic.type_name for topic in bag.topics}
+    types = types_of(bag)
     there = fed(fitting.values())
-    required = needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())[0]
+    required = needed_inputs(system)[0]
     sure = any(
         types[name] not in entry.second for name, entry in fitting.items() if not entry.companion
     )
@@ -194,7 +215,7 @@ def _matching(
         for entry in inputs_of(system)
         if _can_read(topic, entry)
         and entry.is_named(topic.name)
-        and 'truth' not in topic.name.split('/')[:-1]
+        and not is_truth(topic.name.rpartition('/')[0])
     }
     if topics is not None:
         chosen = {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
@@ -224,14 +245,14 @@ def _only_ones(
     there = fed(fitting.values())
     if not there:
         return {}
-    missing = set(needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())[0]) - there
+    missing = set(needed_inputs(system)[0]) - there
     found = {}
     for entry in inputs_of(system):
         could = [
             topic.name
             for topic in bag.topics
             if entry.may_be(topic.name, topic.type_name)
-            and 'truth' not in topic.name.split('/')
+            and not is_truth(topic.name)
             and not any(each.is_named(topic.name) for each in inputs_of(system))
         ]
         if entry.name in missing and len(could) == 1 and could[0] not in fitting:
@@ -244,7 +265,7 @@ def _sure_instead(
 ) -> dict[str, InputTopic]:
     """The one topic without the name of an input that is nobody else's instrument, where all that
     have such names may be: a pose, where the only fix is in latitude and longitude."""
-    types = {topic.name: topic.type_name for topic in bag.topics}
+    types = types_of(bag)
     primary = {name: entry for name, entry in fitting.items() if not entry.companion}
     if not primary or not all(types[name] in entry.second for name, entry in primary.items()):
         return {}
@@ -257,14 +278,14 @@ def _sure_instead(
         and topic.type_name not in entry.second
         and entry.may_be(topic.name, topic.type_name)
         and not any(each.is_named(topic.name) for each in inputs_of(system))
-        and 'truth' not in topic.name.split('/')
+        and not is_truth(topic.name)
     }
     return found if len(found) == 1 else {}
 
 
 def _of_use(bag: BagReader, fitting: Mapping[str, InputTopic]) -> dict[str, InputTopic]:
     """Without companions of what is not there, and without what may be another instrument's."""
-    types = {topic.name: topic.type_name for topic in bag.topics}
+    types = types_of(bag)
     second = {name for name, entry in fitting.items() if types[name] in entry.second}
     sure = {
         name: entry
@@ -297,12 +318,12 @@ def fed(entries: Iterable[InputTopic]) -> set[str]:
 
 def knows_inputs(system: str, names: Collection[str]) -> bool:
     """Whether a tracker, or a node before it, has inputs of all these names."""
-    return {*names} <= {entry.name for entry in (*inputs_of(system), *made_inputs(system))}
+    return {*names} <= {entry.name for entry in every_input(system)}
 
 
 def _mapped(bag: BagReader, system: str, name: str, wanted: str) -> InputTopic:
     """Check one entry of a topic map."""
-    entries = {entry.name: entry for entry in (*inputs_of(system), *made_inputs(system))}
+    entries = {entry.name: entry for entry in every_input(system)}
     if wanted not in entries:
         raise BagError(
             f"the {system} tracker has no input '{wanted}'"
@@ -331,7 +352,8 @@ def made_topics(bag: BagReader, system: str) -> dict[str, InputTopic]:
         topic.name: entry
         for entry in made_inputs(system)
         for topic in bag.topics
-        if entry.may_be(topic.name, topic.type_name) and 'truth' not in topic.name.split('/')[:-1]
+        if entry.may_be(topic.name, topic.type_name)
+        and not is_truth(topic.name.rpartition('/')[0])
     }
 
 
@@ -345,7 +367,7 @@ def _nothing_fits(bag: BagReader, system: str) -> str:
         f'{topic.name} as {entry.name}'
         for topic in bag.topics
         for entry in inputs_of(system)
-        if entry.may_be(topic.name, topic.type_name) and 'truth' not in topic.name.split('/')
+        if entry.may_be(topic.name, topic.type_name) and not is_truth(topic.name)
     ]
     hint = f'; name the topic to use {" or ".join(maybe)}' if maybe else types_heard(system)
     return (

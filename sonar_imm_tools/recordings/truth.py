@@ -6,7 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Truth as messages, below the topic ``/truth``, also from a CSV of positions.
+"""Truth as messages, below the topic ``/truth``, also from a CSV of positions; simulated scenes as
+bags, each measurement on the input topic of its tracker.
 
 A velocity that the file does not state comes from central differences of the positions
 (`numpy.gradient`, uneven steps allowed). It is as noisy as the positions: with one position per
@@ -15,13 +16,17 @@ second and 0.5 m of noise it is good to about 0.4 m/s. A single position has the
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msg_adapters.inputs import inputs_of, InputTopic, made_inputs
 from msg_adapters.table import encode_table
-from sonar_imm.truth import TrueTrack, Truth
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.truth import Scene, TrueTrack, Truth
 
 from .conversion import ConversionReport, converter, flags_of, Record, write_bag
 from .convert_options import TruthOptions
@@ -29,6 +34,7 @@ from .messages import ros_message
 from .places import LocalFrame
 from .tables import CsvOptions, Row
 from .track_files import open_table
+from .writer import BagWriter
 
 TRUTH_TOPIC = '/truth/estimate'
 
@@ -61,7 +67,7 @@ def convert_truth(path: Path, how: TruthOptions, report: ConversionReport) -> No
     values: as in `TruthOptions`.
     """
     records = _records(path, report, how.options, how.frame_id, how.origin)
-    write_bag(report.path, records, report, source=path.name, storage=how.storage)
+    write_bag(report, records, path, how)
 
 
 def truth_records(
@@ -129,3 +135,36 @@ def difference_velocity(stamps_ns: NDArray[np.int64], position: ArrayLike) -> ND
         return np.full(position.shape, np.nan)
     seconds = (stamps_ns - stamps_ns[0]) * 1e-9
     return np.gradient(position, seconds, axis=0)
+
+
+def write_scene(
+    scene: Scene,
+    out: str | Path,
+    *,
+    provenance: dict[str, str],
+    compressed: bool = False,
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+) -> ConversionReport:
+    """Write measurements and truth, in the order of reception, and the `parameters` of the
+    instruments by the names of nodes. Raises `BagError`."""
+    report = ConversionReport(Path(out))
+    inputs: dict[type, InputTopic] = {}
+    for system in SYSTEMS:
+        for entry in (*inputs_of(system), *made_inputs(system)):
+            for measurement in entry.measurements:
+                inputs.setdefault(measurement, entry)
+    records: list[Record] = []
+    for item in scene.measurements:
+        entry = inputs[type(item.measurement)]
+        topic = namespaced(item.namespace, f'/{entry.name}')
+        records.append((item.received_ns, topic, entry.write(item.measurement, ros_message)))
+    for true in scene.truth:
+        records += records_of(true, scene.frame_id)
+    images = any(inputs[type(item.measurement)].makes for item in scene.measurements)
+    with BagWriter(
+        out, compressed=compressed or images, custom_data=provenance, parameters=parameters
+    ) as bag:
+        for log_ns, topic, message in sorted(records, key=lambda record: record[0]):
+            bag.write(topic, message, log_ns)
+            report.messages[topic] += 1
+    return report

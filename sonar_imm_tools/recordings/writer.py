@@ -76,11 +76,6 @@ def naming(path: Path) -> Iterator[None]:
         raise BagError(f'{path} cannot be written: {error}') from None
 
 
-def _is_plain(name: str) -> bool:
-    """Whether the storage file may have the name of its folder, as `ros2 bag record` does it."""
-    return name.isprintable() and len(os.fsencode(name)) < 240
-
-
 class BagWriter:
     """A new recording at `path`, a directory that must not exist; use it in a ``with`` statement.
 
@@ -113,7 +108,8 @@ class BagWriter:
         try:
             self._unfinished = self._place.enter_context(whole(self.path))
             self._made = self._unfinished
-            if not _is_plain(self._made.name):
+            name = self._made.name  # of the storage file too, as `ros2 bag record` does it
+            if not (name.isprintable() and len(os.fsencode(name)) < 240):
                 self._made = self._made.with_name(PLAIN)
             self._writer = Writer(
                 self._made, version=8, storage_plugin=StoragePlugin[storage.upper()]

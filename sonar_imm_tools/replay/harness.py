@@ -119,10 +119,7 @@ def run_lockstep(
                 arguments += _losing_nothing(f'{entry.makes}.publisher')
             before = stack.enter_context(
                 NodeProcess(
-                    name,
-                    domain_id=domain,
-                    arguments=arguments,
-                    module=f'sonar_imm.nodes.{name}',
+                    name, domain_id=domain, arguments=arguments, module=f'sonar_imm.nodes.{name}'
                 )
             )
             first = FirstStep(link, f'/{name}', trouble=before.trouble)
@@ -143,12 +140,7 @@ def run_lockstep(
             exit_code, log = before.stop() or exit_code, log + before.log()
         result = player.result()
         return LockstepResult(
-            recorder.estimates(),
-            lockstep.counts,
-            result.delays,
-            exit_code,
-            log,
-            result.problems,
+            recorder.estimates(), lockstep.counts, result.delays, exit_code, log, result.problems
         )
 
 
@@ -270,28 +262,17 @@ def _swept(domain_id: int) -> bool:
     return not living
 
 
-def local_discovery() -> contextlib.AbstractContextManager[None]:
-    """Let what is started meanwhile, nodes and links, find others on this machine only."""
-    return _environment(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOCALHOST_ONLY=None)
-
-
 @contextlib.contextmanager
-def _environment(**values: str | None) -> Iterator[None]:
-    """Set environment variables for a while; None unsets."""
-    before = {name: os.environ.get(name) for name in values}
-    _set_environment(values)
+def local_discovery() -> Iterator[None]:
+    """Let what is started meanwhile, nodes and links, find others on this machine only."""
+    names = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY'
+    before = {name: os.environ.pop(name) for name in names if name in os.environ}
+    os.environ[names[0]] = 'LOCALHOST'
     try:
         yield
     finally:
-        _set_environment(before)
-
-
-def _set_environment(values: Mapping[str, str | None]) -> None:
-    for name, value in values.items():
-        if value is None:
-            os.environ.pop(name, None)
-        else:
-            os.environ[name] = value
+        os.environ.pop(names[0], None)
+        os.environ.update(before)
 
 
 def _losing_nothing(endpoint: str) -> list[str]:
@@ -301,10 +282,7 @@ def _losing_nothing(endpoint: str) -> list[str]:
 
 
 def _arguments(
-    bag: BagReader,
-    node: str,
-    inputs: Mapping[str, InputTopic],
-    params_file: Path | str | None,
+    bag: BagReader, node: str, inputs: Mapping[str, InputTopic], params_file: Path | str | None
 ) -> list[str]:
     """Write the ROS arguments of a node that loses no input and expects the types of the bag."""
     expected: dict[str, str] = {}

@@ -109,11 +109,6 @@ def play(
         return player.result()
 
 
-def _kept(name: str, qos: QoSProfile) -> QoSProfile:
-    """`qos`, for ``/tf_static`` with all messages kept for listeners that come later."""
-    return transforms_qos() if name.rpartition('/')[2] == 'tf_static' else qos
-
-
 class Player:
     """One playing of one open bag over one link."""
 
@@ -185,8 +180,10 @@ class Player:
             except ImportError as error:
                 self._problems.append(f'topic {name} is not published: {error}')
                 continue
+            # Of /tf_static all messages are kept, for listeners that come later.
+            usual = transforms_qos() if name.rpartition('/')[2] == 'tf_static' else qos
             publishers[name] = self._link.node.create_publisher(
-                cls, options.remap.get(name, name), options.qos.get(name) or _kept(name, qos)
+                cls, options.remap.get(name, name), options.qos.get(name) or usual
             )
         if not publishers:
             raise BagError(f'{self._bag.path} has nothing to publish')

@@ -6,18 +6,30 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The parameters of a simulated scene."""
+"""What the scenes of all systems share: how their parameters are named, when they begin, and noise
+that lasts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+import math
 from typing import Any, ClassVar, TypeVar
 
 from attrs import frozen
+import numpy as np
+from numpy.random import Generator
+from scipy.signal import lfilter
 
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import nanoseconds
 from sonar_imm.parameters import Config, ConfigError, did_you_mean
 
 S = TypeVar('S', bound='Scenario')
+Scenarios = dict[str, tuple[str, dict[str, Any]]]
+"""Named scenes: what each is, and what differs from the defaults of its parameters."""
+
+FIRST_STAMP_NS = 1_700_000_000_000_000_000
+"""When scenes begin."""
 
 
 @frozen(kw_only=True)
@@ -30,20 +42,19 @@ class Scenario(Config):
     INSTRUMENT: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
-    def named(
-        cls: type[S],
-        name: str,
-        scenarios: Mapping[str, tuple[str, dict[str, Any]]],
-        overrides: Mapping[str, Any] | None,
-    ) -> S:
-        """The scenario `name` out of `scenarios` (name: description, values), with some values
-        replaced. Raises `ConfigError` naming mistakes."""
-        if name not in scenarios:
-            raise ConfigError(
-                f"unknown scenario '{name}'{did_you_mean(name, scenarios)}; there are "
-                f'{", ".join(scenarios)}'
-            )
-        return cls.from_mapping({**scenarios[name][1], **(overrides or {})})
+    def among(cls: type[S], scenarios: Scenarios) -> Callable[..., S]:
+        """The function ``scenario(name, overrides)``: one of `scenarios`, some values replaced.
+        It raises `ConfigError` naming mistakes."""
+
+        def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> S:
+            if name not in scenarios:
+                raise ConfigError(
+                    f"unknown scenario '{name}'{did_you_mean(name, scenarios)}; there are "
+                    f'{", ".join(scenarios)}'
+                )
+            return cls.from_mapping({**scenarios[name][1], **(overrides or {})})
+
+        return scenario
 
     def instruments(self) -> dict[str, Any]:
         """What a tracker has to know of the instruments, by the names of its parameters."""
@@ -52,3 +63,22 @@ class Scenario(Config):
     def feeder_instruments(self) -> dict[str, Any]:
         """What a node before that of the tracker has to know of the instruments."""
         return {}
+
+
+def stamps_of(seconds: FloatArray) -> np.ndarray:
+    """Stamps (n,), ns, of times (n,) since a scene began."""
+    return FIRST_STAMP_NS + np.round(seconds * 1e9).astype(np.int64)
+
+
+def delay_ns(config: Any, rng: Generator) -> int:
+    """By how much a scan is received late: most are not."""
+    late = config.late_delay * rng.uniform() if rng.uniform() < config.late_fraction else 0.0
+    return nanoseconds(late)
+
+
+def lasting(white: FloatArray, keep: float) -> FloatArray:
+    """White noise (n, ...) of unit variance, each value of which keeps a share of the one before:
+    Gauss and Markov's, whose variance is one throughout."""
+    white = white.copy()
+    white[1:] *= math.sqrt(1.0 - keep * keep)
+    return np.asarray(lfilter([1.0], [1.0, -keep], white, axis=0))

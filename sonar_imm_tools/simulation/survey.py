@@ -24,6 +24,7 @@ from typing import Any
 
 from attrs import evolve, frozen
 import numpy as np
+from numpy.random import Generator
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from sonar_imm.acoustics.geometry import rotation
@@ -35,9 +36,8 @@ from sonar_imm.truth import Received, Scene
 from ..recordings.export.points import Points
 from .bathymetry.ship import navigation_of, Ship, ship_of, Terrain, Waves
 from .bathymetry.simulator import BathymetryScenario, hear, profile_below
-from .scenario import Scenario
+from .scenario import FIRST_STAMP_NS, lasting, Scenario, Scenarios
 
-FIRST_STAMP_NS = 1_700_000_000_000_000_000
 TERRAINS = ('survey', 'flat', 'slope')
 SECONDS = {'attitude': 3.0, 'heave': 5.0, 'heading': 30.0, 'position': 60.0}
 """How long errors of the navigation last."""
@@ -86,23 +86,14 @@ class SurveyScenario(Scenario):
     # fmt: on
 
 
-SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
+# fmt: off
+SCENARIOS: Scenarios = {
     'survey': ('twelve lines and three across, 12 to 28 m deep, with biases and false echoes', {}),
-    'flat': (
-        'one line over a level floor, with the errors that the tracker supposes',
-        {
-            'lines': 1,
-            'cross_lines': 0,
-            'terrain': 'flat',
-            'roll_bias_deg': 0.0,
-            'tide_std': 0.0,
-            'sound_speed_error': 0.0,
-            'outliers': 0.0,
-            'fish': False,
-            'ghost': False,
-        },
-    ),
+    'flat': ('one line over a level floor, with the errors that the tracker supposes',
+        {'lines': 1, 'cross_lines': 0, 'terrain': 'flat', 'roll_bias_deg': 0.0, 'tide_std': 0.0,
+         'sound_speed_error': 0.0, 'outliers': 0.0, 'fish': False, 'ghost': False}),
 }
+# fmt: on
 
 
 @frozen(eq=False)
@@ -135,9 +126,7 @@ class Floor:
         return np.asarray(map_coordinates(self.z, where, order=1, mode='nearest'))
 
 
-def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> SurveyScenario:
-    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
-    return SurveyScenario.named(name, SCENARIOS, overrides)
+scenario = SurveyScenario.among(SCENARIOS)
 
 
 def simulate(config: SurveyScenario, seed: int) -> SurveyScene:
@@ -158,7 +147,7 @@ def simulate(config: SurveyScenario, seed: int) -> SurveyScene:
 
 
 def _plan(
-    config: SurveyScenario, rng: np.random.Generator
+    config: SurveyScenario, rng: Generator
 ) -> tuple[Floor, list[tuple[tuple[float, float], float, float]], FloatArray]:
     """The floor, start, course and length of each line, and the corrections (L, 6)."""
     width = (config.lines - 1) * config.spacing
@@ -246,7 +235,7 @@ def _swaths(
     start: tuple[float, float],
     correction: FloatArray,
     first_ns: int,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Scene:
     """Pings and navigation of a line."""
     ship = ship_of(sonar, sonar.sonar_depth, rng)
@@ -318,7 +307,7 @@ def budget() -> ErrorBudget:
     )
 
 
-def _floor(config: SurveyScenario, width: float, rng: np.random.Generator) -> Floor:
+def _floor(config: SurveyScenario, width: float, rng: Generator) -> Floor:
     margin = (config.reach + 0.5) * 1.4 * config.depth
     x = np.arange(-margin, config.length + margin, _STEP)
     y = np.arange(-margin - 0.5 * config.spacing, width + 0.5 * config.spacing + margin, _STEP)
@@ -361,7 +350,7 @@ def _line(
     length: float,
     corrections: FloatArray,
     first_ns: int,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Points:
     t = np.arange(0.0, length / config.speed, config.ping_interval)
     errors = budget()
@@ -426,24 +415,17 @@ def _line(
     return Points(stamp_ns, {name: values[found] for name, values in columns.items()})
 
 
-def _slow(rng: np.random.Generator, t: FloatArray, seconds: float) -> FloatArray:
-    """Gauss-Markov errors of unit variance at times t (P,)."""
+def _slow(rng: Generator, t: FloatArray, seconds: float) -> FloatArray:
+    """Errors of unit variance at times t (P,)."""
     keep = math.exp(-(t[1] - t[0]) / seconds) if len(t) > 1 else 0.0
-    white = rng.standard_normal(len(t))
-    values = np.empty(len(t))
-    values[0] = white[0]
-    for k in range(1, len(t)):
-        values[k] = keep * values[k - 1] + math.sqrt(1.0 - keep * keep) * white[k]
-    return values
+    return lasting(rng.standard_normal(len(t)), keep)
 
 
-def _along_swath(rng: np.random.Generator, pings: int, beams: int) -> FloatArray:
+def _along_swath(rng: Generator, pings: int, beams: int) -> FloatArray:
     """Noise of unit variance that neighbours of a swath share in part, as a filter's is."""
-    keep = 1.0 / 3.0
     white = rng.standard_normal((pings, 2, beams))
-    for k in range(1, beams):
-        white[..., k] = keep * white[..., k - 1] + math.sqrt(1.0 - keep**2) * white[..., k]
-    return np.asarray(white.reshape(pings, 2 * beams))
+    own = np.moveaxis(lasting(np.moveaxis(white, -1, 0), 1.0 / 3.0), 0, -1)
+    return own.reshape(pings, 2 * beams)
 
 
 def _ray(
@@ -490,7 +472,7 @@ def _depth_below(
 
 
 def _falsify(
-    config: SurveyScenario, number: int, line: Points, rng: np.random.Generator
+    config: SurveyScenario, number: int, line: Points, rng: Generator
 ) -> tuple[BoolArray, BoolArray]:
     """Put false echoes into a line, in place; which are bad, and which of these are fish."""
     n = len(line)

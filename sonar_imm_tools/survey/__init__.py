@@ -8,13 +8,4 @@
 
 """Many lines, one chart: crossing adjustment and the grid of looks."""
 
-__all__ = [
-    'adjustment',
-    'chart',
-    'grid',
-    'jobs',
-    'line',
-    'looks',
-    'making',
-    'products',
-]
+__all__ = ['adjustment', 'chart', 'grid', 'jobs', 'line', 'looks', 'making', 'products']

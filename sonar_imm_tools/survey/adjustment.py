@@ -32,7 +32,7 @@ from collections.abc import Callable, Iterator, Sequence
 import math
 from typing import Any
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, eigh
 from scipy.sparse import csc_array, csr_array, diags_array, hstack
@@ -40,9 +40,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from sonar_imm.acoustics.sounding import ErrorBudget
-from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
+from sonar_imm.estimation.arrays import FloatArray, IntArray
 
-from .line import PARAMETERS, partials
+from .line import PARAMETERS, partials, Rows
 from .looks import gradients, Looks, MAD, runs_of, strips
 
 NU, REWEIGHTINGS = 4.0, 8
@@ -51,6 +51,7 @@ CLOSE = 3e-3
 are: by then each correction is within .03 of its stated deviation of where more would take it."""
 ROUNDS = 3
 BLOCK_SECONDS, LONGEST_BLOCK = 10.0, 160.0
+SOUND_SPEED = 1500.0
 DRIFT_SECONDS = 60.0
 """How long errors of heading and position last, which are considered only."""
 LAYERS_STD = 5.0
@@ -156,7 +157,6 @@ def adjust(
     budget: ErrorBudget,
     priors: Priors | None = None,
     fixed: Sequence[int] = (),
-    sound_speed: float = 1500.0,
     states: bool = True,
     note: Callable[[int, float], None] = lambda number, rms: None,
     solved: Rounds | None = None,
@@ -174,7 +174,7 @@ def adjust(
     history, value = solved.rms.tolist(), solved.value
     corrections = unknowns.totals(value)
     for number in range(len(history), ROUNDS + 1):
-        found = Crossing.of(statistics(corrections), sound_speed)
+        found = Crossing.of(statistics(corrections))
         equations = _Equations(found, unknowns, corrections, budget)
         history.append(found.rms())
         if number:
@@ -205,7 +205,7 @@ def adjust(
 
 
 @frozen(eq=False)
-class Crossing:
+class Crossing(Rows):
     """Looks (m,) in cells that two lines or more see, sorted by cell and line.
 
     cell: number of the cell, from 0; line: number; time s; z: height at the centre, m; variance of
@@ -224,7 +224,7 @@ class Crossing:
     cells: int
 
     @classmethod
-    def of(cls, lines: Sequence[Looks], sound_speed: float = 1500.0) -> Crossing:
+    def of(cls, lines: Sequence[Looks]) -> Crossing:
         """Of the looks of lines; where they are more than `MOST_LOOKS`, of every second cell, of
         every fourth, and so on: what lasts for seconds limits the corrections, not noise.
 
@@ -232,7 +232,7 @@ class Crossing:
         """
         parts: list[Crossing] = []
         every = 1
-        for part in crossings(lines, sound_speed):
+        for part in crossings(lines):
             parts.append(part.thinned(every))
             while sum(len(each.z) for each in parts) > MOST_LOOKS:
                 every *= 2
@@ -240,17 +240,15 @@ class Crossing:
         firsts = np.cumsum([0, *(part.cells for part in parts)])
         if not firsts[-1]:
             raise ValueError('no two lines overlap')
-        whole = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _OF_LOOKS}
         cell = np.concatenate([part.cell + first for part, first in zip(parts, firsts.tolist())])
-        return cls(cell=cell, cells=int(firsts[-1]), **whole)
+        return evolve(cls.joined(parts), cell=cell, cells=int(firsts[-1]))
 
     def thinned(self, every: int) -> Crossing:
         """Each cell whose number `every` divides."""
         if every == 1:
             return self
-        rows = self.cell % every == 0
-        chosen = {name: getattr(self, name)[rows] for name in _OF_LOOKS}
-        return Crossing(cell=self.cell[rows] // every, cells=-(-self.cells // every), **chosen)
+        chosen = self.chosen(self.cell % every == 0)
+        return evolve(chosen, cell=chosen.cell // every, cells=-(-self.cells // every))
 
     def rms(self) -> float:
         """Of looks about the weighted means of their cells, robust."""
@@ -260,36 +258,28 @@ class Crossing:
         return robust_rms(self.z - mean[self.cell])
 
 
-_OF_LOOKS = ('line', 'time', 'z', 'variance', 'g', 'partials', 'depth')
-
-
-def crossings(lines: Sequence[Looks], sound_speed: float = 1500.0) -> Iterator[Crossing]:
+def crossings(lines: Sequence[Looks]) -> Iterator[Crossing]:
     """What lines have in common, by parts of the floor."""
     for looks, inside in strips(lines):
-        yield _crossing(looks, inside, sound_speed)
-
-
-def _crossing(looks: Looks, inside: BoolArray, sound_speed: float) -> Crossing:
-    """In the cells of those looks that are inside."""
-    starts, _, group = runs_of(looks.ix, looks.iy)
-    least = np.minimum.reduceat(looks.line, starts)
-    most = np.maximum.reduceat(looks.line, starts)
-    shared = (least < most) & inside[starts]
-    rows = shared[group]
-    g = gradients(looks, looks.ix[starts][shared], looks.iy[starts][shared])
-    cell = (np.cumsum(shared) - 1)[group[rows]]
-    chosen, g = looks.chosen(rows), g[cell]
-    return Crossing(
-        cell=cell,
-        line=chosen.line,
-        time=chosen.time,
-        z=chosen.heights(g),
-        variance=chosen.variances(g),
-        g=g,
-        partials=partials(chosen.basis, g, sound_speed),
-        depth=2.0 * chosen.basis[:, 8] - sound_speed * chosen.basis[:, 1],
-        cells=int(shared.sum()),
-    )
+        starts, _, group = runs_of(looks.ix, looks.iy)
+        least = np.minimum.reduceat(looks.line, starts)
+        most = np.maximum.reduceat(looks.line, starts)
+        shared = (least < most) & inside[starts]
+        rows = shared[group]
+        g = gradients(looks, looks.ix[starts][shared], looks.iy[starts][shared])
+        cell = (np.cumsum(shared) - 1)[group[rows]]
+        chosen, g = looks.chosen(rows), g[cell]
+        yield Crossing(
+            cell=cell,
+            line=chosen.line,
+            time=chosen.time,
+            z=chosen.heights(g),
+            variance=chosen.variances(g),
+            g=g,
+            partials=partials(chosen.basis, g, SOUND_SPEED),
+            depth=2.0 * chosen.basis[:, 8] - SOUND_SPEED * chosen.basis[:, 1],
+            cells=int(shared.sum()),
+        )
 
 
 def groups_of(found: Crossing, count: int) -> IntArray:

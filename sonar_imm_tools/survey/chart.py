@@ -54,6 +54,11 @@ class Chart:
         rows, columns = self.bands['depth'].shape
         return rows, columns
 
+    def axes(self, every: int = 1) -> tuple[FloatArray, FloatArray]:
+        """East of the middle of every so many columns, and north of that of rows."""
+        rows, columns = (np.arange(0.5, count)[::every] for count in self.shape)
+        return self.west + self.cell * columns, self.north - self.cell * rows
+
 
 def values_of(nodes: Nodes) -> dict[str, FloatArray]:
     """The bands (k,) of nodes: depths positive down, standard deviations in m."""

@@ -28,8 +28,8 @@ import numpy as np
 from sonar_imm.acoustics.sounding import ErrorBudget
 from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 
-from .line import common_variance, Line, PARAMETERS, partials
-from .looks import gradients, looks_of, MAD, medians, runs_of
+from .line import common_variance, Line, medians, PARAMETERS, partials
+from .looks import gradients, looks_of, MAD, runs_of
 
 REACH = 0.75
 """Cells from a node to the furthest sounding that it uses."""

@@ -36,7 +36,7 @@ from ..recordings.export.points import origin_of, read_points
 from ..recordings.sources import BagError
 from ..recordings.writer import naming
 from .grid import grid_of_looks, HALO, Soundings
-from .line import budget_of, joined_lines, Line, line_of, without_far
+from .line import budget_of, Line, line_of, without_far
 from .looks import Looks, looks_of
 
 TILE = 64
@@ -249,7 +249,7 @@ def make_tile(job: TileJob) -> None:
         sound_speed = json.loads(source.with_suffix('.json').read_text())['sound_speed']
         lines.append(_line(rows, sound_speed))
         numbers.append(np.full(len(rows), k))
-    soundings = Soundings(joined_lines(lines), np.concatenate(numbers))
+    soundings = Soundings(Line.joined(lines), np.concatenate(numbers))
     nodes = grid_of_looks(
         soundings, job.tile.cell, job.tile.box, job.budget, job.covariance, job.crossing_rms
     )

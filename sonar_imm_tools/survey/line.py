@@ -26,9 +26,9 @@ All are linear in g, so the means of `Line.basis` over a cell give its partials 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
-from attrs import evolve, fields, frozen
+from attrs import asdict, evolve, frozen
 import numpy as np
 
 from sonar_imm.acoustics.sounding import ErrorBudget, uncertainties
@@ -59,8 +59,31 @@ STATED = (
 """Parameters of a run that a survey uses."""
 
 
+R = TypeVar('R', bound='Rows')
+
+
 @frozen(eq=False)
-class Line:
+class Rows:
+    """A class whose arrays are columns of equal length."""
+
+    def chosen(self: R, rows: BoolArray | IntArray) -> R:
+        """Some of the rows."""
+        return evolve(self, **{name: column[rows] for name, column in self._columns()})
+
+    @classmethod
+    def joined(cls, parts: Sequence[R]) -> R:
+        """The rows of several, one after the other; all else is that of the first."""
+        columns = zip(*([column for _, column in part._columns()] for part in parts))
+        names = [name for name, _ in parts[0]._columns()]
+        return evolve(parts[0], **dict(zip(names, map(np.concatenate, columns))))
+
+    def _columns(self) -> list[tuple[str, Any]]:
+        values = asdict(self, recurse=False)
+        return [(name, value) for name, value in values.items() if isinstance(value, np.ndarray)]
+
+
+@frozen(eq=False)
+class Line(Rows):
     """Soundings (n,) sorted by stamp, x and y.
 
     xy (n, 2), z (n,) m; noise (n,) variance of z that is a sounding's own, m^2; geometry (n,)
@@ -117,11 +140,6 @@ class Line:
             ]
         )
 
-    def chosen(self, rows: BoolArray | IntArray) -> Line:
-        """Some of the soundings."""
-        arrays = [field.name for field in fields(Line) if field.name != 'sound_speed']
-        return evolve(self, **{name: getattr(self, name)[rows] for name in arrays})
-
 
 def line_of(points: Points, budget: ErrorBudget, sound_speed: float = 1500.0) -> Line:
     """The line in a table of soundings. Own noise is the vertical uncertainty less the budget
@@ -164,10 +182,13 @@ def without_far(points: Points) -> Points:
     xy = np.column_stack([points['x'], points['y']])[rows]
     start = np.flatnonzero(np.diff(stamp_ns, prepend=stamp_ns[0] - 1))
     ping = np.repeat(np.arange(len(start)), np.diff(start, append=len(stamp_ns)))
-    *middle, reach = _medians(np.column_stack([xy, slant]), ping, start).T
+    count = np.bincount(ping)
+    *middle, reach = (
+        medians(column[np.lexsort((column, ping))], start, count) for column in (*xy.T, slant)
+    )
     places = np.column_stack(middle)
     near = np.hypot(*(xy - places[ping]).T) <= slant + reach[ping] + SLACK
-    near &= _reached((stamp_ns[start] - stamp_ns[0]) * 1e-9, places, np.bincount(ping))[ping]
+    near &= _reached((stamp_ns[start] - stamp_ns[0]) * 1e-9, places, count)[ping]
     if near.all():
         return points
     kept = np.sort(rows[near])
@@ -200,23 +221,9 @@ def _reached(seconds: FloatArray, places: FloatArray, soundings: IntArray) -> Bo
     return np.asarray(np.repeat(reached, last - first + 1))
 
 
-def _medians(values: FloatArray, ping: IntArray, start: IntArray) -> FloatArray:
-    """Return the medians (P, k) of values (n, k) of each ping, which begins at `start`."""
-    count = np.bincount(ping)
-    columns = []
-    for column in values.T:
-        ordered = column[np.lexsort((column, ping))]
-        columns.append(0.5 * (ordered[start + (count - 1) // 2] + ordered[start + count // 2]))
-    return np.column_stack(columns)
-
-
-def joined_lines(parts: Sequence[Line]) -> Line:
-    """Soundings of several lines, one line after the other."""
-    arrays = [field.name for field in fields(Line) if field.name != 'sound_speed']
-    whole: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays
-    }
-    return evolve(parts[0], **whole)
+def medians(values: FloatArray, starts: IntArray, counts: IntArray) -> FloatArray:
+    """Medians of groups whose values (n,) are sorted within each group."""
+    return np.asarray(0.5 * (values[starts + (counts - 1) // 2] + values[starts + counts // 2]))
 
 
 def budget_of(run: Mapping[str, Any] | None) -> tuple[ErrorBudget, float]:

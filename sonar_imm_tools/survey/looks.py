@@ -17,12 +17,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import math
 
-from attrs import evolve, fields, frozen
+from attrs import evolve, frozen
 import numpy as np
 
 from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 
-from .line import BASIS, Line
+from .line import BASIS, Line, medians, Rows
 
 MAD = 1.4826
 """Standard deviation of normal errors over their median absolute deviation."""
@@ -39,7 +39,7 @@ LOOKS_AT_ONCE = 400_000
 
 
 @frozen(eq=False)
-class Looks:
+class Looks(Rows):
     """Statistics (m,) of looks, sorted by cell, line and side.
 
     ix, iy: cell number, whole multiples of `cell`; line, side: numbers; count of members; time:
@@ -63,11 +63,6 @@ class Looks:
 
     def __len__(self) -> int:
         return len(self.z)
-
-    def chosen(self, rows: BoolArray | IntArray) -> Looks:
-        """Some of the looks."""
-        names = [field.name for field in fields(Looks) if field.name != 'cell']
-        return evolve(self, **{name: getattr(self, name)[rows] for name in names})
 
     def numbered(self, line: int) -> Looks:
         """The same as looks of line number `line`."""
@@ -139,14 +134,6 @@ def looks_of(line: Line, cell: float, number: IntArray | int = 0) -> Looks:
     )
 
 
-def joined(parts: Sequence[Looks]) -> Looks:
-    """The looks of several lines, sorted by cell, line and side."""
-    names = [field.name for field in fields(Looks) if field.name != 'cell']
-    whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    order = np.lexsort((whole['side'], whole['line'], whole['iy'], whole['ix']))
-    return Looks(parts[0].cell, **{name: values[order] for name, values in whole.items()})
-
-
 def strips(lines: Sequence[Looks]) -> Iterator[tuple[Looks, BoolArray]]:
     """The floor strip by strip along its longer side: the looks of all lines there, and which of
     them are in the strip and not only near enough for the gradients in it. Each line is taken from
@@ -181,7 +168,9 @@ def strips(lines: Sequence[Looks]) -> Iterator[tuple[Looks, BoolArray]]:
             looks = lines[k]
             where = (looks.ix, looks.iy)[axis]
             parts.append(looks.chosen((where >= start - halo) & (where < end + halo)))
-        together = joined(parts)
+        together = Looks.joined(parts)
+        order = (together.side, together.line, together.iy, together.ix)
+        together = together.chosen(np.lexsort(order))
         where = (together.ix, together.iy)[axis]
         yield together, (where >= start) & (where < end)
 
@@ -246,8 +235,3 @@ def runs_of(*keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
         fresh[1:] |= key[1:] != key[:-1]
     starts = np.flatnonzero(fresh)
     return starts, np.diff(np.append(starts, n)), np.cumsum(fresh) - 1
-
-
-def medians(values: FloatArray, starts: IntArray, counts: IntArray) -> FloatArray:
-    """Medians of groups whose values (n,) are sorted within each group."""
-    return np.asarray(0.5 * (values[starts + (counts - 1) // 2] + values[starts + counts // 2]))

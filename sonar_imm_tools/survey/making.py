@@ -28,7 +28,7 @@ import numpy as np
 
 from sonar_imm import __version__
 from sonar_imm.acoustics.sounding import ErrorBudget
-from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.files import marked
 from sonar_imm.parameters import ConfigError
 
@@ -57,7 +57,7 @@ from .jobs import (
     TileJob,
     Unit,
 )
-from .line import budget_of, unstated
+from .line import budget_of, Rows, unstated
 from .looks import Looks
 from .resuming import adjust_lines, find_misties, Misties
 
@@ -172,15 +172,12 @@ def frame_of(sources: Sequence[Source]) -> tuple[float, float, float] | None:
 
 
 @frozen(eq=False)
-class _Depths:
+class _Depths(Rows):
     """What cells of the statistics (m,) say of tiles: number of the cell, depth m, soundings."""
 
-    index: IntArray
+    index: np.ndarray
     depth: FloatArray
     count: FloatArray
-
-    def chosen(self, rows: np.ndarray) -> _Depths:
-        return _Depths(self.index[rows], self.depth[rows], self.count[rows])
 
     def wanted_cell(self, side: float) -> float:
         """The cell that depths and soundings ask for, m; side: of the cells of the statistics."""
@@ -199,13 +196,12 @@ def plan_tiles(lines: Sequence[Looks], resolution: float) -> list[Tile]:
     A tile, from 16 m cells on, is divided in four while the shoalest tenth of its depths asks for
     finer cells, a twentieth of the depth, and half of them would still hold five soundings.
     """
-    indices, depths, counts = [], [], []
+    parts = []
     for looks in lines:
         side = looks.cell
-        indices.append(np.column_stack([looks.ix, looks.iy]).astype(np.int32))
-        depths.append(-looks.z)
-        counts.append(looks.count)
-    every = _Depths(np.concatenate(indices), np.concatenate(depths), np.concatenate(counts))
+        index = np.column_stack([looks.ix, looks.iy]).astype(np.int32)
+        parts.append(_Depths(index, -looks.z, looks.count))
+    every = _Depths.joined(parts)
     if resolution > 0.0:
         # A cell of the statistics may lie in several tiles; those without soundings fall away.
         corners = 0.5 + np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * 0.5 * (1.0 - 1e-9)

@@ -11,9 +11,8 @@ page that shows them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 import contextlib
-import html
 import json
 import math
 import os
@@ -33,6 +32,7 @@ from sonar_imm.parameters import ConfigError
 from sonar_imm.texts import visible
 
 from ..evaluation.plotting import add_points, COLOURS, styled
+from ..evaluation.report import rendered
 from ..offline.run_folder import REPORT
 from ..recordings.csv_writer import CsvWriter
 from ..recordings.sources import BagError
@@ -61,12 +61,7 @@ OF_A_SURVEY = (*BANDS, 'cell')
 
 @contextlib.contextmanager
 def folder_of(
-    out: Path,
-    options: Options,
-    runs: Path,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
+    out: Path, options: Options, runs: Path, *, resume: bool = False, overwrite: bool = False
 ) -> Iterator[Path]:
     """Yield the folder to make a survey of `runs` in: `out` itself, or, where an earlier survey is
     replaced, a new one that takes its place at the end. Where nothing was there and the survey
@@ -221,16 +216,9 @@ def _write_provenance(path: Path, survey: Survey) -> None:
     import pyarrow
     import pyarrow.parquet
 
-    schema = pyarrow.schema(
-        [
-            ('x', pyarrow.float64()),
-            ('y', pyarrow.float64()),
-            ('cell', pyarrow.float32()),
-            ('line', pyarrow.string()),
-            ('count', pyarrow.int32()),
-            ('residual', pyarrow.float32()),
-        ]
-    )
+    numbers = [('x', 'float64'), ('y', 'float64'), ('cell', 'float32')]
+    seen = [('line', 'string'), ('count', 'int32'), ('residual', 'float32')]
+    schema = pyarrow.schema([pyarrow.field(*column) for column in numbers + seen])
     names = np.array([visible(unit.line) for unit in survey.units])
     with (
         whole(path, follow=False) as unfinished,
@@ -263,11 +251,7 @@ def _coverage(chart: Chart, epsg: int) -> dict[str, Any]:
         geometry = transform_geom(f'EPSG:{epsg}', 'EPSG:4326', shape) if epsg else shape
         features.append({'type': 'Feature', 'properties': {}, 'geometry': geometry})
     where = 'WGS 84' if epsg else 'local metres, no coordinate system is known'
-    return {
-        'type': 'FeatureCollection',
-        'name': f'coverage in {where}',
-        'features': features,
-    }
+    return {'type': 'FeatureCollection', 'name': f'coverage in {where}', 'features': features}
 
 
 def _write_crossings(path: Path, survey: Survey) -> None:
@@ -298,29 +282,10 @@ MOST_CELLS = 400
 """Cells along the longer side of a figure."""
 SUN = (math.radians(315.0), math.radians(45.0))
 """Azimuth from north, clockwise, and elevation of the light."""
-STYLE = (
-    'body{font-family:Inter,"Segoe UI",Roboto,Helvetica,Arial,sans-serif;max-width:60rem;'
-    'margin:2rem auto;padding:0 1rem;color:#1b2733}table{border-collapse:collapse}'
-    'td,th{padding:.2rem .8rem;text-align:left;border-bottom:1px solid #e4e9ee}'
-)
 
 
 def write_report(out: Path, survey: Survey, chart: Chart, content: Mapping[str, Any]) -> None:
-    """Write report.html. content: that of adjustment.json."""
-    text = page(survey, chart, content)
-    with whole(out / REPORT, follow=False) as unfinished:
-        unfinished.write_bytes(text.encode('utf-8', 'backslashreplace'))
-
-
-def page(survey: Survey, chart: Chart, content: Mapping[str, Any]) -> str:
-    """The page as text; the same survey gives the same bytes."""
-    parts = [
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width"><title>Survey</title>',
-        f'<style>{STYLE}</style><script>{plotly.offline.get_plotlyjs()}</script></head><body>',
-        f'<h1>Survey</h1><p>{_summary(survey, chart)}</p>',
-        *(f'<p><strong>{_escaped(sentence)}</strong></p>' for sentence in survey.warnings),
-    ]
+    """Write report.html: the same survey, the same bytes. content: that of adjustment.json."""
     seen = chart.bands
     thin = max(1, math.ceil(max(chart.shape) / MOST_CELLS))
     competing = np.where(np.nan_to_num(seen['hypotheses']) > 1, seen['competing_depth'], np.nan)
@@ -343,13 +308,17 @@ def page(survey: Survey, chart: Chart, content: Mapping[str, Any]) -> str:
             misties_figure(survey),
         ),
     ]
-    for number, (title, text, figure) in enumerate(figures):
-        drawn = figure.to_html(full_html=False, include_plotlyjs=False, div_id=f'figure{number}')
-        parts.append(f'<h2>{title}</h2><p>{text}</p>{drawn}')
-    if content['parameters']:
-        parts += _corrections(content)
-    parts.append(f'<p>sonar_imm {__version__}</p></body></html>\n')
-    return '\n'.join(parts)
+    text = rendered(
+        'survey.html',
+        summary=_summary(survey, chart),
+        warnings=survey.warnings,
+        figures=figures,
+        corrections=content['parameters'],
+        not_told=content['not_told'][:20],
+        plotlyjs=plotly.offline.get_plotlyjs(),
+    )
+    with whole(out / REPORT, follow=False) as unfinished:
+        unfinished.write_bytes(f'{text}\n'.encode('utf-8', 'backslashreplace'))
 
 
 def hillshaded(chart: Chart, thin: int) -> go.Figure:
@@ -365,7 +334,7 @@ def hillshaded(chart: Chart, thin: int) -> go.Figure:
         math.sin(azimuth) * east - math.cos(azimuth) * down
     )
     shade = np.clip(light / np.sqrt(1.0 + np.square(east) + np.square(down)), 0.0, 1.0)
-    x, y = _axes(chart, thin)
+    x, y = chart.axes(thin)
     figure.add_heatmap(
         x=x,
         y=y,
@@ -395,7 +364,7 @@ def misties_figure(survey: Survey) -> go.Figure:
 
 
 def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str) -> go.Figure:
-    x, y = _axes(chart, thin)
+    x, y = chart.axes(thin)
     shown = values[::thin, ::thin].astype(np.float32)
     low, high = (-1.0, 1.0)
     if np.isfinite(shown).any():
@@ -411,13 +380,6 @@ def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str
     east = {'title': 'east [m]', 'constrain': 'domain', 'nticks': 5, **axis}
     north = {'title': 'north [m]', 'scaleanchor': 'x', **axis}
     return styled(figure, 560, east, north)
-
-
-def _axes(chart: Chart, thin: int) -> tuple[FloatArray, FloatArray]:
-    rows, columns = chart.shape
-    x = chart.west + chart.cell * (np.arange(columns)[::thin] + 0.5)
-    y = chart.north - chart.cell * (np.arange(rows)[::thin] + 0.5)
-    return np.asarray(x, np.float64), np.asarray(y, np.float64)
 
 
 def _summary(survey: Survey, chart: Chart) -> str:
@@ -440,41 +402,5 @@ def _summary(survey: Survey, chart: Chart) -> str:
         )
     failed = [line['name'] for line in survey.lines if line['failure']]
     if failed:
-        words.append(f'Not read: {_escaped(", ".join(failed))}.')
+        words.append(f'Not read: {", ".join(failed)}.')
     return ' '.join(words)
-
-
-def _corrections(content: Mapping[str, Any]) -> list[str]:
-    """Tables of the corrections, true less reported, and of what could not be told."""
-    rows = [
-        (
-            row['line'] or 'survey',
-            row['name'],
-            f'{row["value"]:+.4f}',
-            f'{row["std"]:.4f}',
-            f'{100.0 * row["told"]:.1f} %',
-        )
-        for row in content['parameters']
-    ]
-    weak = [(f'{100.0 * e["share"]:.1f} %', e['combination']) for e in content['not_told'][:20]]
-    return [
-        '<h2>Corrections</h2><p>True less reported. Determined: share of the prior variance '
-        'that the lines removed.</p>',
-        _table(('of', 'correction', 'value', 'sd', 'determined'), rows),
-        '<h2>Not determined</h2><p>Combinations of corrections, in units of their priors, that '
-        'the lines determine less than the prior does, and the share of its variance that is '
-        'left.</p>',
-        _table(('left', 'combination'), weak),
-    ]
-
-
-def _escaped(text: str) -> str:
-    return html.escape(visible(text))
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = ''.join(f'<th>{name}</th>' for name in heads)
-    body = ''.join(
-        '<tr>' + ''.join(f'<td>{_escaped(cell)}</td>' for cell in row) + '</tr>' for row in rows
-    )
-    return f'<table><tr>{head}</tr>{body}</table>'

@@ -34,8 +34,17 @@ from sonar_imm_tools.evaluation.diver.scoring import score
 from sonar_imm_tools.evaluation.diver.series import series_of, Truth
 from sonar_imm_tools.evaluation.judging import Judgement
 from sonar_imm_tools.evaluation.numbers import Card, Check
-from sonar_imm_tools.evaluation.plotting import in_degrees, nis_figure, scale_length, thin
-from sonar_imm_tools.evaluation.thumbnails import HEIGHT, MARGIN, MOST_POINTS, thumbnail, WIDTH
+from sonar_imm_tools.evaluation.plotting import (
+    HEIGHT,
+    in_degrees,
+    MARGIN,
+    nis_figure,
+    scale_length,
+    thin,
+    thumbnail,
+    THUMBNAIL_POINTS,
+    WIDTH,
+)
 
 RUN = {
     'system': 'diver', 'bag': '/data/my <dive>.bag', 'topics': {'/fix': 'fix'},
@@ -281,8 +290,8 @@ def test_a_line_goes_from_corner_to_corner(layout, first, last):
 def test_gaps_break_a_line_and_long_lines_are_thinned():
     svg = thumbnail(line([0.0, 1.0, np.nan, 3.0], [0.0, 1.0, np.nan, 0.0]))
     assert svg.count('M') == 2 and svg.count('L') == 1
-    many = np.arange(10.0 * MOST_POINTS)
-    assert thumbnail(line(many, many)).count('L') == MOST_POINTS - 1
+    many = np.arange(10.0 * THUMBNAIL_POINTS)
+    assert thumbnail(line(many, many)).count('L') == THUMBNAIL_POINTS - 1
 
 
 def test_points_areas_and_figures_without_lines():

@@ -15,7 +15,7 @@ import numpy as np
 from sonar_imm_tools.recordings.export.points import Points
 from sonar_imm_tools.simulation.survey import budget
 from sonar_imm_tools.survey.grid import Soundings
-from sonar_imm_tools.survey.line import joined_lines, line_of
+from sonar_imm_tools.survey.line import Line, line_of
 
 FILE = Path(__file__).parents[1] / 'vectors' / 'survey' / 'scene.npz'
 BUDGET = budget()
@@ -48,7 +48,7 @@ def lines(data):
 
 def together(parts):
     number = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
-    return Soundings(joined_lines(parts), number)
+    return Soundings(Line.joined(parts), number)
 
 
 def dense(nodes, where, name):

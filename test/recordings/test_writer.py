@@ -20,12 +20,12 @@ import pytest
 from msg_adapters.estimates import read_estimate
 from sonar_imm.measurements import Fix
 from sonar_imm.truth import Received, Scene, TrueReflectors, TrueTrack, TruthTable
-from sonar_imm_tools.recordings import csv_writer, scenes
+from sonar_imm_tools.recordings import csv_writer
 from sonar_imm_tools.recordings.csv_writer import CsvWriter, FEW_ROWS, ROWS_IN_A_BLOCK
 from sonar_imm_tools.recordings.messages import decode_cdr, ros_message, typestore
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
-from sonar_imm_tools.recordings.truth import records_of
+from sonar_imm_tools.recordings.truth import records_of, write_scene
 from sonar_imm_tools.recordings.writer import BagWriter
 
 
@@ -234,7 +234,7 @@ def test_late_measurements_are_recorded_when_they_were_received(tmp_path):
         (Received(START_NS + 9, fix(1)), Received(START_NS + 4, fix(3))),
         (TrueTrack(7, START_NS + np.array([2, 6]), np.zeros((2, 3)), np.ones((2, 2))),),
     )
-    report = scenes.write_scene(scene, tmp_path / 'bag', provenance={})
+    report = write_scene(scene, tmp_path / 'bag', provenance={})
     assert report.messages == {'/fix': 2, '/truth/estimate': 2}
     truth = '/truth/estimate'
     assert logged(tmp_path / 'bag') == [(truth, 2), ('/fix', 4), (truth, 6), ('/fix', 9)]
@@ -249,7 +249,7 @@ def test_a_scene_may_know_other_truth_of_its_own(tmp_path):
             yield TruthTable(self.stamp_ns, frame_id, {'x': np.zeros(1, np.float32)}, 'north')
 
     scene = Scene((Received(START_NS + 1, fix(0), 'south'),), (Buoy(START_NS + 2),))
-    scenes.write_scene(scene, tmp_path / 'bag', provenance={})
+    write_scene(scene, tmp_path / 'bag', provenance={})
     assert logged(tmp_path / 'bag') == [('/south/fix', 1), ('/truth/north/estimate', 2)]
 
 

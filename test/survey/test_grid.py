@@ -37,7 +37,7 @@ from sonar_imm_tools.survey.adjustment import (
 from sonar_imm_tools.survey.chart import chart_of, OF_ONE_RUN, write_geotiff
 from sonar_imm_tools.survey.grid import grid_of_looks
 from sonar_imm_tools.survey.line import BASIS, budget_of, line_of
-from sonar_imm_tools.survey.looks import FLOOR, gradients, joined, Looks, looks_of, strips
+from sonar_imm_tools.survey.looks import FLOOR, gradients, Looks, looks_of, strips
 
 BUDGET = budget()
 HEAVE, OWN = BUDGET.heave**2, 0.04**2
@@ -342,7 +342,8 @@ def small(seed=1, lines=3, cells=60):
 def dense(made, priors):
     """Partials (m, P), heights (m,), variances and blocks of ten seconds, and the incidence of
     cells, written down row by row."""
-    looks = joined(made)
+    looks = Looks.joined(made)
+    looks = looks.chosen(np.lexsort((looks.side, looks.line, looks.iy, looks.ix)))
     L, m = len(made), len(looks)
     J = np.zeros((m, 3 + 3 * L))
     for row in range(m):

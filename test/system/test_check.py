@@ -38,7 +38,7 @@ from sonar_imm.measurements import Start, StaticTransforms  # noqa: E402
 from sonar_imm_tools.cli import main  # noqa: E402
 from sonar_imm_tools.cli.checking import play_recording  # noqa: E402
 from sonar_imm_tools.recordings.messages import ros_message  # noqa: E402
-from sonar_imm_tools.recordings.scenes import write_scene  # noqa: E402
+from sonar_imm_tools.recordings.truth import write_scene  # noqa: E402
 from sonar_imm_tools.recordings.writer import BagWriter  # noqa: E402
 from sonar_imm_tools.simulation.diver import simulator as diver  # noqa: E402
 from sonar_imm_tools.simulation.obstacle import simulator as obstacle  # noqa: E402

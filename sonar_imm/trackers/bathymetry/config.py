@@ -144,9 +144,6 @@ class BathymetryConfig(MountingParameters):
         'expect echoes by way of the surface, as noise from their directions')
     sonar_depth: float = live(3.0, 'm',
         'depth of the sonar below the surface, for multipath', range=(0.0, 12000.0))
-    multipath_level_db: float = constant(0.0, 'dB',
-        'multipath: power of echoes by way of the surface, relative to those of the floor',
-        range=(-60.0, 60.0))
 
     # -- computation -----------------------------------------------------------------------------
     engine: str = constant('auto', '',
@@ -176,9 +173,6 @@ class BathymetryConfig(MountingParameters):
     max_gap: float = live(1.0, 's',
         'longest time between two poses of nav that is interpolated; pings in longer gaps are '
         'skipped', range=(0.01, 60.0))
-    max_extrapolation: float = constant(0.0, 's',
-        'time by which the last bin of a ping may be newer than the newest pose of nav; later '
-        'ones wait', range=(0.0, 10.0))
 
     # -- the water -------------------------------------------------------------------------------
     sound_speed_profile: tuple[float, ...] = live((), '',

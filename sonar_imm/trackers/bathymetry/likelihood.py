@@ -428,15 +428,15 @@ def _beside_surface(
 ) -> _Parts:
     """With echoes by way of the surface as noise from where a flat floor would send them."""
     T, P = iq.shape
-    level = 10.0 ** (0.1 * config.multipath_level_db)
     spacing = swath.geometry.spacing
     sines = swath.surface_sines(floor_below, config.sonar_depth)
-    echoes = 1.0 + level * np.isfinite(sines).sum(axis=1)
+    # They are as strong as the echoes of the floor, of which they are mirror images.
+    echoes = 1.0 + np.isfinite(sines).sum(axis=1)
     signal = _signal(snapshot, staves.power(iq), noise, echoes)
     signal, noise = _split(signal, noise, config)
-    noise = np.maximum(noise, LEAST_NOISE * level * signal)
+    noise = np.maximum(noise, LEAST_NOISE * signal)
     step = 2.0 * math.pi * spacing
-    R = interference.noise_covariance(sines, level * signal[:, None], noise, P, step)
+    R = interference.noise_covariance(sines, signal[:, None], noise, P, step)
     form = interference.interference_form(iq, R)
     sine = coherence.coherence(iq, abs(spacing))[1] if config.is_gaussian else np.full(T, np.nan)
     return _Parts(

@@ -453,10 +453,7 @@ class PoseQueue:
         for snapshot in self._waiting:
             stamps = bin_stamps(snapshot, config)
             known = self._buffer.readiness(
-                int(stamps[0]),
-                int(stamps[-1]),
-                nanoseconds(config.max_gap),
-                nanoseconds(config.max_extrapolation),
+                int(stamps[0]), int(stamps[-1]), nanoseconds(config.max_gap)
             )
             if known == 'wait':
                 waiting.append(snapshot)

@@ -8,8 +8,7 @@
 
 """How runs of the bathymetry tracker are judged: the floor along each ping against the true floor.
 
-`profiles` pairs estimate and truth of each ping, `scoring` compares them. `METRICS`,
-`summary_sentence` and `figures` present the result.
+`METRICS`, `summary_sentence` and `figures` present what `scoring` finds.
 """
 
 from __future__ import annotations
@@ -26,8 +25,7 @@ from sonar_imm.soundings import SIDES
 from ...offline.run_folder import read_truth, RunFolder
 from ..judging import JudgeOptions, Limit, naming, Scored
 from ..numbers import error, fill, look_up, Metric, NO_TRUTH
-from .profiles import profiles_of
-from .scoring import score
+from .scoring import profiles_of, score
 
 if TYPE_CHECKING:
     from ..report import Section
@@ -79,31 +77,23 @@ def _patches(metrics: Mapping[str, Any]) -> object:
     return look_up(metrics, 'height.patch.n') and look_up(metrics, 'height.smooth.n')
 
 
+# fmt: off
 METRICS = (
     Metric(label='pings, range bins', line='{pings}, {bins}'),
     Metric(label='bins with an echo', line='{heard_share:.0%}'),
-    Metric(
-        label='bins with two surfaces',
-        line='{two_share:.1%}',
-        when=lambda metrics: look_up(metrics, 'two_share') is not None,
-    ),
-    Metric(
-        label='two surfaces: found / soundings all the same / single bins lost',
+    Metric(label='bins with two surfaces', line='{two_share:.1%}',
+        when=lambda metrics: look_up(metrics, 'two_share') is not None),
+    Metric(label='two surfaces: found / soundings all the same / single bins lost',
         line='{layover.found:.0%} / {layover.soundings:.0%} / {layover.lost:.1%}',
         when=lambda metrics: (
             look_up(metrics, 'layover.bins') and not look_up(metrics, 'layover.heights')
-        ),
-    ),
-    Metric(
-        label='two surfaces: found / single bins taken for two',
+        )),
+    Metric(label='two surfaces: found / single bins taken for two',
         line='{layover.found:.0%} / {layover.lost:.1%}',
-        when=lambda metrics: look_up(metrics, 'layover.heights'),
-    ),
-    Metric(
-        label='both heights of two surfaces, RMS to the nearest / inside two sd',
+        when=lambda metrics: look_up(metrics, 'layover.heights')),
+    Metric(label='both heights of two surfaces, RMS to the nearest / inside two sd',
         line='{layover.heights.rmse_m:.2f} m / {layover.heights.inside_band:.0%}',
-        when=lambda metrics: look_up(metrics, 'layover.heights.n'),
-    ),
+        when=lambda metrics: look_up(metrics, 'layover.heights.n')),
     Metric(card='Pings', value='{pings}', remark='{bins} range bins', when=_unscored),
     Metric(card='Bins with an echo', value='{heard_share:.0%}', when=_unscored),
     Metric(card='Stated uncertainty, median', value='{height_std_median_m:.2f} m', when=_unscored),
@@ -114,53 +104,29 @@ METRICS = (
     error('height.patch', 'height error, patch'),
     Metric(card='In rough patches, RMS', value='{height.patch.rmse_m:.2f} m', when=_patches),
     error('height.shadow', 'height error, shadow'),
-    error(
-        'angle.all',
-        'angle error, all',
-        'deg',
-        card='Angle error, RMS',
-        value='{angle.all.rmse_deg:.2f}°',
-        remark='',
-    ),
-    Metric(
-        label='inside two sd, smooth / patch',
+    error('angle.all', 'angle error, all', 'deg', card='Angle error, RMS',
+        value='{angle.all.rmse_deg:.2f}°', remark=''),
+    Metric(label='inside two sd, smooth / patch',
         line='{inside_band.smooth:.0%} / {inside_band.patch:.0%}',
-        card='Truth inside two standard deviations',
-        value='{inside_band.all:.0%}',
-        remark='95 % would be perfect',
-        front=True,
-        covers=('inside_band.all', 0.95),
-    ),
-    Metric(
-        label='overlap of the rough patches',
-        line='{segmentation.iou:.2f}',
-        card='Overlap of the rough patches',
-        value='{segmentation.iou:.2f}',
-        front=True,
+        card='Truth inside two standard deviations', value='{inside_band.all:.0%}',
+        remark='95 % would be perfect', front=True, covers=('inside_band.all', 0.95)),
+    Metric(label='overlap of the rough patches', line='{segmentation.iou:.2f}',
+        card='Overlap of the rough patches', value='{segmentation.iou:.2f}', front=True,
         remark='noticed {segmentation.bins_late_in:.0f} bins late, left '
         '{segmentation.bins_late_out:.0f} bins late',
-        when=lambda metrics: look_up(metrics, 'segmentation.patches'),
-    ),
-    Metric(
-        label='floor called smooth / rough / cannot tell',
+        when=lambda metrics: look_up(metrics, 'segmentation.patches')),
+    Metric(label='floor called smooth / rough / cannot tell',
         line='{verdicts.smooth:.0%} / {verdicts.rough:.0%} / {verdicts.cannot_tell:.0%}',
-        when=lambda metrics: look_up(metrics, 'verdicts.rough') is not None,
-    ),
-    Metric(
-        label='of these right, smooth / rough',
+        when=lambda metrics: look_up(metrics, 'verdicts.rough') is not None),
+    Metric(label='of these right, smooth / rough',
         line='{verdicts.smooth_right:.1%} / {verdicts.rough_right:.1%}',
-        when=lambda metrics: look_up(metrics, 'verdicts.rough_right') is not None,
-    ),
-    Metric(
-        label='bins late, into / out of a patch',
-        line='{segmentation.bins_late_in:.0f} / {segmentation.bins_late_out:.0f}',
-    ),
-    Metric(
-        label='shadow passed over',
-        line='{gate.shadow_passed_over:.0%}',
-        when=lambda metrics: look_up(metrics, 'gate.shadow_bins'),
-    ),
+        when=lambda metrics: look_up(metrics, 'verdicts.rough_right') is not None),
+    Metric(label='bins late, into / out of a patch',
+        line='{segmentation.bins_late_in:.0f} / {segmentation.bins_late_out:.0f}'),
+    Metric(label='shadow passed over', line='{gate.shadow_passed_over:.0%}',
+        when=lambda metrics: look_up(metrics, 'gate.shadow_bins')),
 )
+# fmt: on
 
 
 REMARK = ''

@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 import math
 from pathlib import Path
 from typing import Any
@@ -42,8 +43,7 @@ from ..plotting import (
     thin,
 )
 from ..report import Section
-from .profiles import Profile, Swath
-from .scoring import BAND, runs
+from .scoring import BAND, Profile, runs, Swath
 
 MOST_BINS = 1200
 DIRECTIONS = 161
@@ -141,10 +141,8 @@ def profile_figure(profile: Profile) -> go.Figure:
     high, low = (height + BAND * std)[known], (height - BAND * std)[known]
     name = 'two standard deviations'
     add_band(figure, ranges[known], high, low, AMBER, (0.3, 0.6), name=name)
+    _shade_patches(figure, profile)
     if profile.truth is not None:
-        for begin, end in runs(profile.truth.patch):
-            ends = {'x0': profile.range[begin], 'x1': profile.range[end - 1]}
-            figure.add_vrect(**ends, fillcolor=COLOURS[5], opacity=0.12, line_width=0)
         true = np.where(profile.truth.echo, profile.truth.height, np.nan)[shown]
         dotted = {'color': INK, 'width': 1.0, 'dash': 'dot'}
         add_line(figure, ranges, true, 'truth', INK, line=dotted)
@@ -168,6 +166,17 @@ def profile_figure(profile: Profile) -> go.Figure:
             add_points(figure, place, bottom, name, COLOURS[colour], symbol='line-ns-open')
     y = {'title': 'height above the reference [m]'}
     return styled(figure, 400, SLANT | {'zeroline': False}, y)
+
+
+def _patches(profile: Profile) -> list[tuple[float, float]]:
+    """The ranges at which each true patch begins and ends."""
+    found = [] if profile.truth is None else runs(profile.truth.patch)
+    return [(profile.range[begin], profile.range[end - 1]) for begin, end in found]
+
+
+def _shade_patches(figure: go.Figure, profile: Profile) -> None:
+    for begin, end in _patches(profile):
+        figure.add_vrect(x0=begin, x1=end, fillcolor=COLOURS[5], opacity=0.12, line_width=0)
 
 
 def _add_upper(figure: go.Figure, profile: Profile) -> None:
@@ -241,10 +250,8 @@ def models_figure(profile: Profile, names: Sequence[str]) -> go.Figure:
         np.round(profile.probabilities[bins].T, 3),
         hovertemplate='%{x:.2f} m, %{y}: %{z:.3f}<extra></extra>',
     )
-    if profile.truth is not None:
-        for begin, end in runs(profile.truth.patch):
-            for bin_number in (begin, end - 1):
-                figure.add_vline(x=profile.range[bin_number], line={'color': COLOURS[1]})
+    for place in chain(*_patches(profile)):
+        figure.add_vline(x=place, line={'color': COLOURS[1]})
     return styled(figure, 180 + 24 * len(names), SLANT | BARE, BARE)
 
 
@@ -272,11 +279,9 @@ def segmentation_figure(swath: Swath) -> go.Figure:
         hovertemplate='%{x:.2f} m, %{y:.2f} s: %{z:.2f}<extra></extra>',
     )
     ends = [
-        (profile.range[place], when)
+        (place, when)
         for profile, when in zip(profiles, seconds)
-        if profile.truth is not None
-        for begin, end in runs(profile.truth.patch)
-        for place in (begin, end - 1)
+        for place in chain(*_patches(profile))
     ]
     if ends:
         x, y = np.array(ends).T
@@ -289,10 +294,7 @@ def verdict_figure(profile: Profile, rough: FloatArray) -> go.Figure:
     """Probability (n,) of rough floor along one ping, and the bins that cannot be told."""
     figure = go.Figure()
     shown = thin(len(profile.range), MOST_BINS)
-    if profile.truth is not None:
-        for begin, end in runs(profile.truth.patch):
-            ends = {'x0': profile.range[begin], 'x1': profile.range[end - 1]}
-            figure.add_vrect(**ends, fillcolor=COLOURS[5], opacity=0.12, line_width=0)
+    _shade_patches(figure, profile)
     add_line(figure, profile.range[shown], rough[shown], 'rough', COLOURS[0], 1.4)
     assert profile.verdict is not None
     place = profile.range[shown][profile.verdict[shown] == 2]
@@ -327,11 +329,11 @@ def finest_chart(points: Points, run: Mapping[str, Any]) -> Chart:
 
 def chart_figure(grid: Chart, track: FloatArray) -> go.Figure:
     """Height of the floor in the grid, north up, and the track of the ship."""
-    rows, columns = grid.shape
+    x, y = grid.axes()
     figure = go.Figure()
     figure.add_heatmap(
-        x=grid.west + grid.cell * (np.arange(columns) + 0.5),
-        y=grid.north - grid.cell * (np.arange(rows) + 0.5),
+        x=x,
+        y=y,
         z=-grid.bands['depth'].astype(np.float32),
         customdata=np.dstack(
             [grid.bands[name].astype(np.float32) for name in ('uncertainty', 'label', 'count')]
@@ -345,5 +347,5 @@ def chart_figure(grid: Chart, track: FloatArray) -> go.Figure:
     )
     if len(track):
         add_line(figure, track[:, 0], track[:, 1], 'track of the ship', INK, 1.5)
-    x = {'title': 'east [m]', 'zeroline': False, 'constrain': 'domain'}
-    return styled(figure, 520, x, {'title': 'north [m]', 'zeroline': False, 'scaleanchor': 'x'})
+    east = {'title': 'east [m]', 'zeroline': False, 'constrain': 'domain'}
+    return styled(figure, 520, east, {'title': 'north [m]', 'zeroline': False, 'scaleanchor': 'x'})

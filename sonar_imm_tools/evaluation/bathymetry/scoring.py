@@ -6,7 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Scores of estimated floors: errors, coverage of the stated band, and segmentation.
+"""Estimate and truth of each ping bin by bin, and their scores: errors, coverage of the band,
+and segmentation.
 
 Heights and angles are scored in bins with an echo. Shadows are scored apart, because there the
 estimate is a prediction of the models. The segmentation is scored by labels: rough where the rough
@@ -16,16 +17,193 @@ is compared with the nearest of the true ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from attrs import frozen
 import numpy as np
 
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimates import Estimate
+from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
+from sonar_imm.soundings import SIDES
+from sonar_imm.trackers.bathymetry.terrain import KINDS
 
 from ... import SECOND
+from ..columns import read_columns
 from ..numbers import error_summary
-from .profiles import BoolArray, Profile, Swath, TrueFloor
+
+_BINS = (
+    'range?', 'valid', 'height?', 'angle?', 'beam_angle?', 'vertical_uncertainty?', 'rough?',
+    'surfaces?', 'told?', 'height_2?', 'height_2_std?', 'vertical_uncertainty_2?',
+)  # fmt: skip
+_TRUE = ('range?', 'height?', 'angle?', 'patch?', 'valid?', 'surfaces?', 'height_2?')
+FAR = 0.55
+"""Share of a bin by which the range of the true floor may differ from that of the estimate: half a
+bin, and a margin for single precision."""
+
+
+@frozen(eq=False)
+class TrueFloor:
+    """The true floor at the bins of one ping, each (n,): height m and angle rad, NaN where
+    unknown; patch: rough floor; echo: neither shadow nor water column; surfaces: how many answer,
+    None where the truth does not say it, and height_2 m of the second strongest, NaN for none."""
+
+    height: FloatArray
+    angle: FloatArray
+    patch: BoolArray
+    echo: BoolArray
+    surfaces: IntArray | None = None
+    height_2: FloatArray | None = None
+
+    def to_nearest(self, height: FloatArray) -> FloatArray:
+        """Distance (n,) of heights (n,) to the nearest of the true surfaces, m."""
+        off = np.abs(height - self.height)
+        return off if self.height_2 is None else np.fmin(off, np.abs(height - self.height_2))
+
+
+@frozen(eq=False)
+class Profile:
+    """The estimate of one ping, each (n,): height m, angle rad and their standard deviations;
+    probabilities (n, M) of the models; valid: bins with an echo of one surface; two: bins with
+    echoes of two, None where the tracker does not look for them; truth: None where unknown;
+    side: empty where the estimate does not say it; rough: probability (n,) of rough floor where
+    the estimate itself says it; verdict (n,): smooth 0, rough 1 or cannot
+    tell 2, None where the estimate does not say it; upper: height m and standard deviation
+    (n,) each of the upper of two surfaces, NaN for none, None where the tracker does not say them:
+    the height is then that of the lower, and unsure (n,): bins with an echo of one surface or two.
+    """
+
+    stamp_ns: int
+    range: FloatArray
+    height: FloatArray
+    height_std: FloatArray
+    angle: FloatArray
+    angle_std: FloatArray
+    valid: BoolArray
+    probabilities: FloatArray
+    truth: TrueFloor | None
+    side: str = ''
+    rough: FloatArray | None = None
+    two: BoolArray | None = None
+    verdict: FloatArray | None = None
+    upper: tuple[FloatArray, FloatArray] | None = None
+    unsure: BoolArray | None = None
+
+    @property
+    def echoes(self) -> BoolArray:
+        """Bins (n,) with an echo."""
+        echoes = self.valid if self.two is None else self.valid | self.two
+        return echoes if self.unsure is None else echoes | self.unsure
+
+
+@frozen(eq=False)
+class Swath:
+    """All pings of a run in order; rough: which of `model_names` mean rough floor."""
+
+    profiles: tuple[Profile, ...]
+    model_names: tuple[str, ...]
+    rough: BoolArray
+
+    def roughness(self, profile: Profile) -> FloatArray:
+        """Probability (n,) that the floor is rough; NaN when no model means rough floor."""
+        if profile.rough is not None:
+            return profile.rough
+        if not self.rough.any():
+            return np.full(len(profile.range), np.nan)
+        return profile.probabilities[:, self.rough].sum(axis=1)
+
+
+def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None) -> Swath:
+    """The estimates of a run, each with the truth of the same stamp and side."""
+    known = {(table.stamp_ns, table.source): table for table in truth or ()}
+    profiles: list[Profile] = []
+    names: tuple[str, ...] = ()
+    for estimate in estimates:
+        names = estimate.model_names
+        # A single side that is no namespace: its truth names no side.
+        single = known.get((estimate.stamp_ns, 0))
+        profiles.append(
+            profile_of(estimate, known.get((estimate.stamp_ns, estimate.source), single))
+        )
+    return Swath(tuple(profiles), names, rough_models(names))
+
+
+def rough_models(names: tuple[str, ...]) -> BoolArray:
+    """Return which models (M,) mean rough floor. Beside a constant slope it is the random walk,
+    beside `steady` floor the rough `KINDS`; of walks, whose noise grows from model to model, the
+    upper half. A single model never does."""
+    if 'steady' in names:
+        known = {kind.name for kind in KINDS if kind.rough}
+        return np.array([name in known for name in names])
+    if 'ncs' in names:
+        return np.array([name == 'rw' for name in names])
+    rough = np.arange(len(names)) >= len(names) // 2
+    return rough & (len(names) > 1)
+
+
+def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
+    """One ping; the state is a height or an angle, and the other one follows from it. With
+    navigation the stated error is that of the soundings: pose and sound speed are in it."""
+    bins = read_columns(
+        estimate, _BINS, "the estimates are not those of a floor: there is no column '{}'"
+    )
+    std = np.sqrt(estimate.covariance[:, 0, 0])
+    # A small angle moves the point along the circle around the sonar: dh = |y| d(angle).
+    arm = np.abs(estimate.xyz[:, 1].astype(np.float64))
+    arm = np.where(arm > 0.0, arm, np.nan)
+    in_angle = estimate.state_names[0] == 'angle'
+    height_std = std * arm if in_angle else std
+    if 'vertical_uncertainty' in estimate.extras:
+        arm = np.abs(bins['range'] * np.sin(bins['beam_angle']))
+        height_std = np.sqrt(bins['vertical_uncertainty'])
+    upper = None
+    if 'height_2' in estimate.extras:
+        upper_std = bins['height_2_std']
+        if 'vertical_uncertainty_2' in estimate.extras:
+            upper_std = np.sqrt(bins['vertical_uncertainty_2'])
+        upper = bins['height_2'], upper_std
+    return Profile(
+        stamp_ns=estimate.stamp_ns,
+        range=bins['range'],
+        height=bins['height'],
+        height_std=height_std,
+        angle=bins['angle'],
+        angle_std=std if in_angle else std / arm,
+        valid=bins['valid'] > 0,
+        probabilities=estimate.probabilities,
+        truth=None if truth is None else true_floor(truth, bins['range']),
+        rough=bins['rough'] if 'rough' in estimate.extras else None,
+        side=SIDES[estimate.source] if 'side' in estimate.extras else '',
+        two=bins['surfaces'] == 2 if 'surfaces' in estimate.extras else None,
+        verdict=bins['told'] if 'told' in estimate.extras else None,
+        upper=upper,
+        unsure=None if upper is None else (bins['surfaces'] == 1) & (bins['valid'] == 0),
+    )
+
+
+def true_floor(truth: Estimate, ranges: FloatArray) -> TrueFloor:
+    """The true floor at `ranges` (n,); unknown in bins that the truth does not have."""
+    where, height, angle, patch, valid, surfaces, second = read_columns(
+        truth, _TRUE, "the truth is not that of a floor: it has no column '{}'"
+    ).values()
+    if not len(where):
+        unknown, no = np.full(len(ranges), np.nan), np.zeros(len(ranges), bool)
+        return TrueFloor(unknown, unknown, no, no)
+    after = np.clip(np.searchsorted(where, ranges), 1, max(len(where) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(where) - 1)
+    nearest = np.where(ranges - where[before] <= where[after] - ranges, before, after)
+    width = float(np.median(np.diff(ranges))) if len(ranges) > 1 else np.inf
+    found = np.abs(where[nearest] - ranges) <= FAR * width
+    return TrueFloor(
+        height=np.where(found, height[nearest], np.nan),
+        angle=np.where(found, angle[nearest], np.nan),
+        patch=found & (patch[nearest] > 0),
+        echo=found & (valid[nearest] > 0),
+        surfaces=np.where(found, surfaces[nearest], 0) if 'surfaces' in truth.extras else None,
+        height_2=np.where(found, second[nearest], np.nan) if 'height_2' in truth.extras else None,
+    )
+
 
 BAND = 2.0
 """Half width of the band in figures and scores, in standard deviations."""

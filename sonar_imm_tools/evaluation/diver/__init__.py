@@ -8,9 +8,9 @@
 
 """How runs of the diver tracker are judged: tracks of positions against true paths.
 
-`series` holds the estimates as flat arrays, `truth` the true paths, `matching` says which track
-belongs to which diver, `scoring` compares them. `METRICS`, `summary_sentence` and `figures`
-present the result.
+`series` holds the estimates and the true paths as flat arrays and says which track belongs to
+which diver, `scoring` compares them. `METRICS`, `summary_sentence` and `figures` present the
+result.
 """
 
 from __future__ import annotations
@@ -108,22 +108,14 @@ def _truncated(metrics: Mapping[str, Any]) -> bool:
     return bool(look_up(metrics, 'beyond_cutoff.n')) and not _unscored(metrics)
 
 
+# fmt: off
 METRICS = (
-    Metric(
-        label='divers found',
+    Metric(label='divers found',
         line='{tracks.completeness:.0%} of the time, within {cutoff_m:.3g} m; the errors below '
-        'are those of then',
-        card='Divers found',
-        value='{tracks.completeness:.0%}',
-        remark='within {cutoff_m:.3g} m; the errors are those of then',
-        when=_truncated,
-    ),
-    Metric(
-        card='Confirmed tracks',
-        value='{tracks_confirmed}',
-        remark='{stamps} stamps in {span_s:.0f} s',
-        when=_unscored,
-    ),
+        'are those of then', card='Divers found', value='{tracks.completeness:.0%}',
+        remark='within {cutoff_m:.3g} m; the errors are those of then', when=_truncated),
+    Metric(card='Confirmed tracks', value='{tracks_confirmed}',
+        remark='{stamps} stamps in {span_s:.0f} s', when=_unscored),
     error('position', 'position error', card='Position error, RMS', front=True),
     error('raw_fix', 'raw fixes', card='Raw fixes, RMS', remark='{raw_fix.n} fixes', front=True),
     error('velocity', 'velocity error', 'mps', card='Velocity error, RMS', remark=''),
@@ -132,30 +124,17 @@ METRICS = (
     chi2('consistency.nees_position', 'NEES, position', card='NEES of the position'),
     chi2('consistency.nees_state', 'NEES, whole state'),
     chi2('consistency.nis', 'NIS', card='NIS of the hits'),
-    Metric(
-        label='truth inside 50 / 90 / 95 % ellipse',
+    Metric(label='truth inside 50 / 90 / 95 % ellipse',
         line=' / '.join(f'{{consistency.coverage.{level}:.0%}}' for level in (50, 90, 95)),
-        card='Truth inside the 95 % ellipse',
-        value='{consistency.coverage.95:.0%}',
-        remark='95 % would be perfect',
-        front=True,
-    ),
-    Metric(
-        covers=('consistency.coverage.95', 0.95),
-        nees='consistency.nees_position',
-        when=lambda metrics: look_up(metrics, 'consistency.verdict') is not None,
-    ),
-    Metric(
-        label='best lag of the estimates',
-        line='{lag.best_s:.2f} s, then RMSE {lag.rmse_at_best_m:.3f} m',
-    ),
-    Metric(
-        card='Tracks / true targets',
-        value='{tracks.tracks} / {tracks.true_targets}',
+        card='Truth inside the 95 % ellipse', value='{consistency.coverage.95:.0%}',
+        remark='95 % would be perfect', front=True),
+    Metric(covers=('consistency.coverage.95', 0.95), nees='consistency.nees_position',
+        when=lambda metrics: look_up(metrics, 'consistency.verdict') is not None),
+    Metric(label='best lag of the estimates',
+        line='{lag.best_s:.2f} s, then RMSE {lag.rmse_at_best_m:.3f} m'),
+    Metric(card='Tracks / true targets', value='{tracks.tracks} / {tracks.true_targets}',
         remark='{tracks.identity_switches} identity switches, {tracks.false_tracks} false, '
-        '{tracks.completeness:.0%} complete',
-        when=_several,
-    ),
+        '{tracks.completeness:.0%} complete', when=_several),
     *each(
         'tracks',
         (
@@ -169,6 +148,7 @@ METRICS = (
         ),
     ),
 )
+# fmt: on
 
 
 def seen(metrics: Mapping[str, Any]) -> str:

@@ -42,8 +42,7 @@ from ..plotting import (
     view_of,
 )
 from ..report import Section
-from .matching import match, Matching
-from .series import Series, Truth
+from .series import match, Matching, Series, Truth
 
 MOST_ELLIPSES = 60
 MOST_TRACKS_NAMED = 12
@@ -85,9 +84,7 @@ def sections(
         )
     else:
         yield Section(
-            'Stated uncertainty',
-            f'One sigma on each axis.{which}',
-            sigma_figure(series, track_id),
+            'Stated uncertainty', f'One sigma on each axis.{which}', sigma_figure(series, track_id)
         )
     if series.model_names:
         yield Section(

@@ -44,8 +44,7 @@ from ..numbers import (
     relative_nees,
     usable_nees,
 )
-from .matching import match, Matching, track_summary
-from .series import Series, Truth
+from .series import match, Matching, Series, track_summary, Truth
 
 COVERAGE_LEVELS = (0.5, 0.9, 0.95)
 LAG_RANGE = 30.0
@@ -87,10 +86,7 @@ def score(
     metrics['cutoff_m'] = float(cutoff)
     metrics['scored_stamps'] = len(matching.scan_ns)
     beyond = len(matching.beyond_row)
-    metrics['beyond_cutoff'] = {
-        'n': beyond,
-        'share': beyond / max(1, beyond + len(matching.row)),
-    }
+    metrics['beyond_cutoff'] = {'n': beyond, 'share': beyond / max(1, beyond + len(matching.row))}
     metrics['position'] = error_summary(matching.distance)
     speed_error = np.hypot(*matching.error[:, 2:].T)
     metrics['velocity'] = error_summary(speed_error[np.isfinite(speed_error)], unit='mps')

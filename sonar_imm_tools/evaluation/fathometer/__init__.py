@@ -8,9 +8,7 @@
 
 """How runs of the fathometer tracker are judged: sets of reflectors against true sets.
 
-`records` pairs estimates and truth, `scoring` compares numbers, depths and amplitudes of the
-reflectors. `METRICS`, `summary_sentence`
-and `figures` present the result.
+`METRICS`, `summary_sentence` and `figures` present what `scoring` finds.
 """
 
 from __future__ import annotations
@@ -21,8 +19,7 @@ from typing import Any, TYPE_CHECKING
 from ...offline.run_folder import read_truth, RunFolder
 from ..judging import JudgeOptions, Limit, Scored
 from ..numbers import error, fill, Metric, NO_TRUTH
-from .records import records_of
-from .scoring import CUTOFF, score
+from .scoring import CUTOFF, records_of, score
 
 if TYPE_CHECKING:
     from ..report import Section
@@ -58,49 +55,28 @@ def _unscored(metrics: Mapping[str, Any]) -> bool:
     return 'scored_records' not in metrics
 
 
+# fmt: off
 METRICS = (
     Metric(label='records', line='{records}'),
     Metric(label='reflectors per record', line='{reflectors_mean:.2f}'),
     Metric(card='Reflectors per record', value='{reflectors_mean:.1f}', when=_unscored),
     Metric(card='Reflectors in all', value='{ids}', remark='{records} records', when=_unscored),
-    Metric(
-        label='number of reflectors right',
-        line='{order_right:.1%}',
-        card='Number of reflectors right',
-        value='{order_right:.0%}',
-        front=True,
-    ),
-    Metric(
-        label='OSPA',
-        line='{ospa_m:.3f} m',
-        card='OSPA',
-        value='{ospa_m:.3f} m',
-        remark='cutoff {cutoff_m:g} m',
-        front=True,
-    ),
-    Metric(
-        label='false / missed per record',
-        line='{false_per_record:.3f} / {missed_per_record:.3f}',
-        card='False / missed per record',
-        value='{false_per_record:.2f} / {missed_per_record:.2f}',
-    ),
-    error(
-        'depth',
-        'depth error',
-        card='Depth error, RMS',
-        value='{depth.rmse_m:.3f} m',
-        remark='{depth.inside_2_sigma:.0%} within two stated sigma',
-        front=True,
-        covers=('depth.inside_2_sigma', 0.95),
-    ),
-    Metric(
-        label='amplitude error, median / 95 %',
+    Metric(label='number of reflectors right', line='{order_right:.1%}',
+        card='Number of reflectors right', value='{order_right:.0%}', front=True),
+    Metric(label='OSPA', line='{ospa_m:.3f} m', card='OSPA', value='{ospa_m:.3f} m',
+        remark='cutoff {cutoff_m:g} m', front=True),
+    Metric(label='false / missed per record',
+        line='{false_per_record:.3f} / {missed_per_record:.3f}', card='False / missed per record',
+        value='{false_per_record:.2f} / {missed_per_record:.2f}'),
+    error('depth', 'depth error', card='Depth error, RMS', value='{depth.rmse_m:.3f} m',
+        remark='{depth.inside_2_sigma:.0%} within two stated sigma', front=True,
+        covers=('depth.inside_2_sigma', 0.95)),
+    Metric(label='amplitude error, median / 95 %',
         line='{amplitude.median_relative_error:.1%} / {amplitude.p95_relative_error:.1%}',
-        card='Amplitude error, median',
-        value='{amplitude.median_relative_error:.0%}',
-    ),
+        card='Amplitude error, median', value='{amplitude.median_relative_error:.0%}'),
     Metric(label='identity switches', line='{identity_switches}'),
 )
+# fmt: on
 
 
 REMARK = ' (number right in {order_right:.0%} of the records)'

@@ -24,8 +24,7 @@ from ... import SECOND
 from ...offline.run_folder import read_measurements
 from ..plotting import add_image, add_line, add_points, BARE, COLOURS, INK, styled, TIME
 from ..report import Section
-from .records import Image, Record, Reflections
-from .scoring import pair
+from .scoring import Image, pair, Record, Reflections
 
 MOST_DEPTHS, MOST_RECORDS = 500, 1500
 OVER_TIME = {'title': 'time [s]', 'showgrid': False}
@@ -212,7 +211,5 @@ def _thinned(image: Image) -> Image:
     rows, columns = len(depth) // deep * deep, len(stamp) // long * long
     blocks = value[:rows, :columns].reshape(rows // deep, deep, columns // long, long)
     return Image(
-        blocks.max(axis=(1, 3)),
-        depth[:rows].reshape(-1, deep).mean(axis=1),
-        stamp[:columns:long],
+        blocks.max(axis=(1, 3)), depth[:rows].reshape(-1, deep).mean(axis=1), stamp[:columns:long]
     )

@@ -71,34 +71,22 @@ def scored(folder: RunFolder, run: Mapping[str, Any], options: JudgeOptions) -> 
     return metrics, sections
 
 
+# fmt: off
 METRICS = (
-    Metric(
-        card='Confirmed obstacles',
-        value='{tracks_confirmed}',
+    Metric(card='Confirmed obstacles', value='{tracks_confirmed}',
         remark='{pings} pings in {span_s:.0f} s',
-        when=lambda metrics: not look_up(metrics, 'range.n'),
-    ),
+        when=lambda metrics: not look_up(metrics, 'range.n')),
     error('range', 'range error'),
     error('bearing', 'bearing error', 'deg'),
     error('vertical_offset', 'vertical offset error'),
-    error(
-        'vertical_offset_near',
-        f'the same within {NEAR:.0f} m',
-        card=f'Height error within {NEAR:.0f} m, RMS',
-        front=True,
-    ),
+    error('vertical_offset_near', f'the same within {NEAR:.0f} m',
+        card=f'Height error within {NEAR:.0f} m, RMS', front=True),
     chi2('consistency.nees_offset', 'NEES, vertical offset', card='NEES of the offset'),
     chi2('consistency.nees_state', 'NEES, whole state'),
     chi2('consistency.nis', 'NIS', card='NIS of the hits'),
-    Metric(
-        label='truth inside the 90 % band',
-        line='{consistency.band_coverage:.0%}',
-        card='Truth inside the 90 % band',
-        value='{consistency.band_coverage:.0%}',
-        remark='90 % would be perfect',
-        front=True,
-        covers=('consistency.band_coverage', 0.9),
-    ),
+    Metric(label='truth inside the 90 % band', line='{consistency.band_coverage:.0%}',
+        card='Truth inside the 90 % band', value='{consistency.band_coverage:.0%}',
+        remark='90 % would be perfect', front=True, covers=('consistency.band_coverage', 0.9)),
     Metric(label='Brier score of P(above)', line='{above.brier:.3f}'),
     *(
         metric
@@ -119,28 +107,20 @@ METRICS = (
         )
         for name in BEHAVIOURS
     ),
-    Metric(
-        label='Brier score of collisions',
+    Metric(label='Brier score of collisions',
         line='{collisions.brier:.3f}, of a guess {collisions.brier_of_a_guess:.3f} '
-        '({collisions.n} forecasts, {collisions.happened:.0%} happened)',
-    ),
-    Metric(
-        label='GOSPA',
-        line='{gospa.mean_m:.2f} m',
-        card='GOSPA',
-        value='{gospa.mean_m:.2f} m',
+        '({collisions.n} forecasts, {collisions.happened:.0%} happened)'),
+    Metric(label='GOSPA', line='{gospa.mean_m:.2f} m', card='GOSPA', value='{gospa.mean_m:.2f} m',
         front=True,
-        remark='{gospa.missed_per_ping:.2f} missed, {gospa.false_per_ping:.2f} false per ping',
-    ),
-    Metric(
-        label='above the sea floor (tether, if moored)',
-        line='{tether_m:.2f} m, standard deviation {tether_std_m:.2f} m',
-    ),
+        remark='{gospa.missed_per_ping:.2f} missed, {gospa.false_per_ping:.2f} false per ping'),
+    Metric(label='above the sea floor (tether, if moored)',
+        line='{tether_m:.2f} m, standard deviation {tether_std_m:.2f} m'),
     *each(
         'tracks',
         ('true_obstacles', 'found_obstacles', 'tracks', 'false_tracks', 'identity_switches'),
     ),
 )
+# fmt: on
 
 
 def seen(metrics: Mapping[str, Any]) -> str:

@@ -41,8 +41,7 @@ from ..messages import ros_message
 from ..sources import BagError
 from ..tables import Row
 from ..truth import records_of
-from .navigation import ARRAYS, navigation_of_arrays, navigation_of_table
-from .sonar_files import Frame
+from .navigation import ARRAYS, Frame, navigation_of_arrays, navigation_of_table
 
 NAMES: dict[str, tuple[str, ...]] = {
     'iq': ('iq', 'snapshots', 'Y', 'quadrants'),
@@ -101,24 +100,15 @@ def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionRepor
     records += [] if how.nav else navigation_of_arrays(poses, stamps, path, report, frame)
     for ping, (stamp, iq) in enumerate(zip(stamps, samples)):
         report.rows += 1
-        try:
+        snapshot = None
+        with report.leaving_out(content.path, f'ping {ping}'):
             snapshot = _snapshot(content, ping, stamp, iq, constants, how.frame_id)
-        except Rejection as error:
-            report.bad_row(content.path, f'ping {ping}', error)
-            continue
-        records.append((stamp, '/snapshot', write_snapshot(snapshot, ros_message)))
-        if (profile := _true_floor(content, ping, snapshot)) is not None:
+            records.append((stamp, '/snapshot', write_snapshot(snapshot, ros_message)))
+        if snapshot and (profile := _true_floor(content, ping, snapshot)) is not None:
             records += records_of(profile, '')
     report.note_ignored(path, content.unused)
-    write_bag(
-        report.path,
-        records,
-        report,
-        source=path.name,
-        storage=how.storage,
-        parameters={'bathymetry': frame.parameters()},
-        needed='/snapshot',
-    )
+    own = {'bathymetry': frame.parameters()}
+    write_bag(report, records, path, how, own, needed='/snapshot')
 
 
 class _Archive:
@@ -292,7 +282,7 @@ def convert_traces(path: Path, how: TracesOptions, report: ConversionReport) -> 
         records += _from_archive(report, path, how.rate, how.frame_id)
     else:
         records += _from_table(report, CsvTable(path, how.options), how.frame_id)
-    write_bag(report.path, records, report, source=path.name, storage=how.storage, needed='/trace')
+    write_bag(report, records, path, how, needed='/trace')
 
 
 def _from_archive(
@@ -318,7 +308,7 @@ def _from_archive(
     records: list[Record] = []
     for k, stamp in enumerate(stamps):
         report.rows += 1
-        try:
+        with report.leaving_out(path, f'trace {k}'):
             trace = Trace(
                 stamp_ns=stamp,
                 frame_id=frame_id,
@@ -327,10 +317,7 @@ def _from_archive(
                 sigma=None if sigma is None else sigma[k],
                 reference_depth=None if reference is None else reference[k],
             )
-        except Rejection as error:
-            report.bad_row(path, f'trace {k}', error)
-            continue
-        records.append((stamp, '/trace', write_trace(trace, ros_message)))
+            records.append((stamp, '/trace', write_trace(trace, ros_message)))
     return records + _true_reflectors(arrays, path, stamps, frame_id)
 
 
@@ -384,19 +371,11 @@ def _from_table(report: ConversionReport, table: CsvTable, frame_id: str) -> lis
     rows = report.read_rows(table, parse)
     for stamp, group in groupby(rows, key=lambda pair: pair[1][0]):
         lines = list(group)
-        values = np.array([sample[1:] for _, sample in lines])
-        try:
-            trace = Trace(
-                stamp_ns=stamp,
-                frame_id=frame_id,
-                depth=values[:, 0],
-                amplitude=values[:, 1],
-                sigma=values[:, 2],
-            )
-        except Rejection as error:
-            report.bad_row(table.path, f'trace from line {lines[0][0].line}', error)
-            continue
-        records.append((stamp, '/trace', write_trace(trace, ros_message)))
+        depth, amplitude, sigma = np.array([sample[1:] for _, sample in lines]).T
+        given = {'depth': depth, 'amplitude': amplitude, 'sigma': sigma}
+        with report.leaving_out(table.path, f'trace from line {lines[0][0].line}'):
+            trace = Trace(stamp_ns=stamp, frame_id=frame_id, **given)
+            records.append((stamp, '/trace', write_trace(trace, ros_message)))
     return records
 
 
@@ -429,12 +408,7 @@ def numbers_of(path: Path, name: str, array: NDArray) -> NDArray:
 
 
 def _stamps(
-    path: Path,
-    times: NDArray | None,
-    count: int,
-    rate: float,
-    what: str,
-    report: ConversionReport,
+    path: Path, times: NDArray | None, count: int, rate: float, what: str, report: ConversionReport
 ) -> list[int]:
     """Nanoseconds of the stamps of `count` messages, `what` names them; `rate` per second without
     any. Raises `BagError` for those that a message cannot hold."""

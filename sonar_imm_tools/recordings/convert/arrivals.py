@@ -34,7 +34,7 @@ from typing import NamedTuple
 import numpy as np
 
 from msg_adapters.arrivals import write_arrivals
-from sonar_imm.measurements import Arrivals, Rejection
+from sonar_imm.measurements import Arrivals
 
 from ..columns import LOTEK, name_of, THELMA
 from ..conversion import ConversionReport, converter, flags_of, Record, write_bag
@@ -107,7 +107,7 @@ def write_pings(
     passive: bool,
     report: ConversionReport,
     how: ArrivalsOptions | DetectionsOptions,
-) -> ConversionReport:
+) -> None:
     """Write one message for each ping, by its name and its tag. passive: nobody knows when a ping
     was emitted. Raises `BagError`."""
     places, senders, origin = stations
@@ -119,31 +119,20 @@ def write_pings(
     records: list[Record] = []
     streams: dict[str, list[int]] = {}
     for label, ping in pings.items():
-        try:
+        with report.leaving_out(table.path, f'ping {label[0]}'):
             measurement = _of_ping(
                 ping, passive, places, senders, numbers, sender_numbers, how.frame_id
             )
-            records.append(
-                (measurement.stamp_ns, '/arrivals', write_arrivals(measurement, ros_message))
-            )
-            streams.setdefault(label[1], []).append(measurement.stamp_ns)
-        except Rejection as error:
-            report.bad_row(table.path, f'ping {label[0]}', error)
+            stamp = measurement.stamp_ns
+            records.append((stamp, '/arrivals', write_arrivals(measurement, ros_message)))
+            streams.setdefault(label[1], []).append(stamp)
     if how.truth is not None and records:
         records += truth_records(how.truth, report, how.truth_options, how.frame_id, origin)
     if any(name != str(number) for name, number in numbers.items()):
         report.notes['receivers'] = ', '.join(f'{name} = {numbers[name]}' for name in numbers)
     if passive:
         report.notes['emission'] = 'unknown; the stamp is the earliest arrival of the ping'
-    return write_bag(
-        report.path,
-        records,
-        report,
-        source=table.path.name,
-        storage=how.storage,
-        parameters={'diver': origin_parameters(origin)},
-        streams=streams,
-    )
+    write_bag(report, records, table.path, how, {'diver': origin_parameters(origin)}, streams)
 
 
 def _tag_numbers(names: list[str], report: ConversionReport) -> dict[str, int]:

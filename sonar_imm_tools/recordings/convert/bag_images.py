@@ -20,7 +20,7 @@ Navigation and altitudes, which the trackers need too, are copied.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,13 +31,14 @@ from msg_adapters.snapshots import FIELDS, snapshot_of_phase, snapshot_of_staves
 from sonar_imm.measurements import Rejection, Snapshot
 from sonar_imm.trackers.obstacle.detector import DetectorConfig
 
-from ..conversion import companion_topics, ConversionReport, converter, copied, write_from_bag
+from ..conversion import ConversionReport, converter, provenance
 from ..convert_options import ImagesOptions, InterferometerOptions
 from ..measurements import DetectedImages
 from ..messages import ros_message
 from ..reader import BagMessage, BagReader
 from ..sources import BagError
-from ..topics import made_topics
+from ..topics import made_topics, types_of
+from ..writer import BagWriter
 
 SYSTEM = 'obstacle'
 FURTHER = {entry.name: entry for entry in inputs_of(SYSTEM) if entry.name != 'detections'}
@@ -58,7 +59,7 @@ def convert_images(path: Path, how: ImagesOptions, report: ConversionReport) -> 
             return None if message is None else (f'/{name}', message)
 
         topics = sorted({name for name, _ in readers})
-        write_from_bag(report.path, bag, topics, make, report, storage=how.storage)
+        _write_from_bag(bag, topics, make, report, how.storage)
         report.problems += bag.problems
 
 
@@ -98,10 +99,10 @@ def _readers(
                 detections.name,
                 partial(_detections, detections, read),
             )
-    types = {topic.name: topic.type_name for topic in bag.topics}
-    for topic_name, name in companion_topics(bag, FURTHER).items():
+    types = types_of(bag)
+    for topic_name, name in _companion_topics(bag, FURTHER).items():
         kind = types[topic_name]
-        readers[topic_name, kind] = name, partial(copied, FURTHER[name], kind)
+        readers[topic_name, kind] = name, partial(_copied, FURTHER[name], kind)
     return readers
 
 
@@ -146,18 +147,17 @@ def convert_interferometer(
             raise BagError(
                 f"{path} has no topic '{missing[0]}'; it has {', '.join(sorted(there))}"
             )
-        beside = companion_topics(bag, BESIDE)
+        beside = _companion_topics(bag, BESIDE)
         pings = _Pings(topics)
 
         def written(item: BagMessage) -> tuple[str, Any] | None:
             if item.topic in beside:
                 name = beside[item.topic]
-                return f'/{name}', copied(BESIDE[name], item.type_name, item.message)
+                return f'/{name}', _copied(BESIDE[name], item.type_name, item.message)
             images = pings.add(item)
             return None if images is None else (target, write_snapshot(make(*images), ros_message))
 
-        chosen = [*set(topics), *beside]
-        write_from_bag(report.path, bag, chosen, written, report, storage=how.storage)
+        _write_from_bag(bag, [*set(topics), *beside], written, report, how.storage)
         if pings.lonely:
             report.bad_rows += pings.lonely
             report.problems.append(
@@ -205,3 +205,46 @@ class _Pings:
             del self._waiting[next(iter(self._waiting))]
             self._given_up += 1
         return None
+
+
+def _write_from_bag(
+    bag: BagReader,
+    topics: Collection[str],
+    make: Callable[[BagMessage], tuple[str, Any] | None],
+    report: ConversionReport,
+    storage: str,
+) -> None:
+    """Write a new bag of messages of another one, in recorded order and with their times. make:
+    topic and message for one of `bag`, or None where there is none yet; those for which it raises
+    `Rejection` are counted and named."""
+    notes = provenance(bag.path.name, report.notes)
+    with BagWriter(report.path, storage=storage, custom_data=notes) as made:
+        for item in bag.messages(topics):
+            report.rows += 1
+            written = None
+            with report.leaving_out(bag.path, f'{item.topic} #{item.index}'):
+                written = make(item)
+            if written is not None:
+                topic, message = written
+                made.write(topic, message, item.log_ns)
+                report.messages[topic] += 1
+
+
+def _companion_topics(bag: BagReader, wanted: Mapping[str, InputTopic]) -> dict[str, str]:
+    """Inputs that a tracker needs beside what is converted, such as navigation: input name by
+    topic, for the first topic of `bag` of each kind in `wanted`."""
+    chosen = {}
+    for name, entry in wanted.items():
+        fitting = [topic.name for topic in bag.topics if topic.type_name in entry.readers]
+        if fitting:
+            chosen[fitting[0]] = name
+    return chosen
+
+
+def _copied(entry: InputTopic, type_name: str, message: Any) -> Any:
+    """The message of a bag as our own. Raises `Rejection`."""
+    # A frame that calls itself NED is turned into ENU; others stay as they are, and whoever tracks
+    # the new bag states their convention.
+    ned = str(message.header.frame_id).endswith('_ned')
+    measurement = entry.readers[type_name](message, world_frame='ned' if ned else 'enu')
+    return entry.write(measurement, ros_message)

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
@@ -143,6 +144,7 @@ def convert_detections(path: Path, how: DetectionsOptions, report: ConversionRep
                 f'{names[received.receiver[k]]}: it shares no ping of a fixed tag with the others'
             )
     std = std or rounding
+    optional = (np.nan if std is None else std * std, *(np.nan,) * 6)
     pings: dict[tuple[object, str], list[Arrival]] = {}
     for tag in tags:
         if tag in fixed:
@@ -151,7 +153,7 @@ def convert_detections(path: Path, how: DetectionsOptions, report: ConversionRep
         window = how.window or _window(received.receiver[own], stamps[own], size, tag, report)
         for ping, members in enumerate(gather(received.receiver[own], stamps[own], window)):
             pings[ping, tag] = [
-                _arrival(int(stamps[k]), names[received.receiver[k]], tag, std)
+                Arrival('', int(stamps[k]), np.nan, '', names[received.receiver[k]], optional, tag)
                 for k in own[members]
             ]
     if not pings and fixed:
@@ -172,11 +174,6 @@ def _note(report: ConversionReport, clocks: Clocks, names: Sequence[str]) -> Non
         f'{", ".join(spread)} at the begin and the end; {clocks.used} detections of fixed tags '
         f'agree to {1e3 * clocks.std:.2f} ms'
     )
-
-
-def _arrival(stamp_ns: int, receiver: str, tag: str, std: float | None) -> Arrival:
-    var = np.nan if std is None else std * std
-    return Arrival('', stamp_ns, np.nan, '', receiver, (var, *(np.nan,) * 6), tag)
 
 
 def _receiver(row: Row, known: Mapping[str, int]) -> str:
@@ -306,10 +303,10 @@ def compare_clocks(
         offset = _solve(received.receiver[row[keep]], seconds[row[keep]], reduced[row[keep]],
                         ping[keep], knots, len(receivers))  # fmt: skip
         rest = reduced[row] - _at(offset, knots, received.receiver[row], seconds[row])
-        rest = rest - _medians(rest, ping)
+        rest = rest - ndimage.median(rest, ping, np.arange(len(groups)))[ping]
         sigma = max(1.4826 * float(np.median(np.abs(rest[keep]))), LEAST)
         better = np.abs(rest) <= FAR * sigma
-        better &= _counts(better, ping)[ping] > 1
+        better &= np.bincount(ping, better)[ping] > 1.0
         if (better == keep).all() or better.sum() < 2:
             break
         keep = better
@@ -392,17 +389,6 @@ def _solve(
 def _means(values: FloatArray, ping: IntArray) -> FloatArray:
     counts = np.bincount(ping)
     return np.asarray((np.bincount(ping, values) / np.maximum(counts, 1))[ping])
-
-
-def _medians(values: FloatArray, ping: IntArray) -> FloatArray:
-    """The median of each ping at its rows; rows of a ping are neighbours."""
-    ends = np.flatnonzero(np.diff(ping)) + 1
-    parts = np.split(values, ends)
-    return np.concatenate([np.full(len(part), np.median(part)) for part in parts])
-
-
-def _counts(keep: BoolArray, ping: IntArray) -> IntArray:
-    return np.bincount(ping, keep.astype(np.int64)).astype(np.int64)
 
 
 def _connected(receiver: IntArray, ping: IntArray, receivers: int) -> BoolArray:

@@ -65,11 +65,12 @@ def convert_fixes(path: Path, how: FixesOptions, report: ConversionReport) -> No
 
 def write_fixes(
     table: Table, report: ConversionReport, how: FixesOptions, beside: Sequence[Record] = ()
-) -> ConversionReport:
+) -> None:
     """`convert_fixes` of a table that is open, with records `beside` its own."""
     table.require('stamp')
     polar = None
-    if table.has('range', 'bearing') and not _has_places(table):
+    placed = table.has('x', 'y') or table.has('latitude', 'longitude')
+    if table.has('range', 'bearing') and not placed:
         if how.bearings == 'bow':
             raise BagError(
                 f'{table.path}: bearings from the bow need the pose of the vessel; see '
@@ -171,15 +172,9 @@ def write_fixes(
             f'{len(repeated)} rows hold a position that came before, the first in line '
             f'{repeated[0]}; the tracker leaves them out (repeat_time)'
         )
-    return write_bag(
-        report.path,
-        itertools.chain(records, truth, beside) if rows else [],
-        report,
-        source=table.path.name,
-        storage=how.storage,
-        parameters={'diver': origin_parameters(origin)},
-        streams=by_name((name if named else '', stamp) for _, stamp, _, name in read),
-    )
+    streams = by_name((name if named else '', stamp) for _, stamp, _, name in read)
+    every = itertools.chain(records, truth, beside) if rows else []
+    write_bag(report, every, table.path, how, {'diver': origin_parameters(origin)}, streams)
 
 
 def _ask_for_vessel(table: Table) -> None:
@@ -224,10 +219,6 @@ def _may_be_of_vessel(table: Table) -> bool:
     vessel = any(table.has(name) for name in ('vessel_x', 'vessel_latitude'))
     ranks = [rank_of(name, table.header(name)) for name in names]
     return not vessel and min(ranks) >= 0 and not set(names) & set(table.options.columns)
-
-
-def _has_places(table: Table) -> bool:
-    return table.has('x', 'y') or table.has('latitude', 'longitude')
 
 
 def _shared(stamps: Sequence[int]) -> str:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from msg_adapters.array_records import write_pressure
-from sonar_imm.measurements import Pressure, Rejection
+from sonar_imm.measurements import Pressure
 
 from ... import SECOND
 from ..conversion import ConversionReport, converter, provenance
@@ -104,7 +104,7 @@ def _write_blocks(
         pressure = samples[:, channels] * np.float32(scale or how.full_scale)
         stamp_ns = start_ns + round(done * SECOND / audio.samplerate)
         done += len(samples)
-        try:
+        with report.leaving_out(source, f'{done / audio.samplerate:.1f} s'):
             block = Pressure(
                 stamp_ns=stamp_ns,
                 frame_id=how.frame_id,
@@ -113,11 +113,8 @@ def _write_blocks(
                 reference_depth=how.depth,
                 scale=scale,
             )
-        except Rejection as error:
-            report.bad_row(source, f'{done / audio.samplerate:.1f} s', error)
-            continue
-        bag.write('/pressure', write_pressure(block, ros_message), stamp_ns)
-        report.messages['/pressure'] += 1
+            bag.write('/pressure', write_pressure(block, ros_message), stamp_ns)
+            report.messages['/pressure'] += 1
 
 
 def _opened(path: Path) -> soundfile.SoundFile:

@@ -6,11 +6,14 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Where an instrument was, for conversions of what does not say it: a table beside the input, or
-arrays of an archive with one value per ping.
+"""Where an instrument was, and the way from pings of XTF and folders of pictures into a bag.
 
-Positions in degrees become metres from the first one. Attitude is in degrees: heading clockwise
-from north, bow up, starboard down.
+What does not say it has a table beside the input, or arrays with one value per ping.
+Positions in degrees become metres from the first one, in ``/nav``; soundings are ``/ground``.
+Attitude is in degrees: heading clockwise from north, bow up, starboard down.
+
+Pings come one by one, so that the length of a file does not matter. One whose clock is off for
+itself is left out; a clock that was set is followed, and said.
 """
 
 from __future__ import annotations
@@ -18,21 +21,198 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 import math
 from pathlib import Path
+from typing import Any, NamedTuple
 
+from attrs import define, Factory
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_imm.measurements import Rejection
+from msg_adapters.detections import SOUND_SPEEDS
+from msg_adapters.navigation import write_navigation, write_range
+from msg_adapters.soundings import write_ground
+from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.acoustics.geometry import quaternion
+from sonar_imm.measurements import Altitude, Ground, Navigation, Rejection
 
-from ..conversion import ConversionReport, flags_of
+from ... import SECOND
+from ..conversion import ConversionReport, flags_of, JUMP, Leaps, provenance
 from ..conversion import Record as Stamped
 from ..csv_table import CsvTable
-from ..places import ask_for_angle, Degrees, TURN
+from ..messages import ros_message
+from ..places import ask_for_angle, Degrees, origin_parameters, TURN
 from ..positions import write_position
 from ..sources import BagError
 from ..tables import CsvOptions, Row
 from ..times import BadRow
-from .sonar_files import Frame, navigation_messages, Record
+from ..writer import BagWriter
+
+LATEST = 2**31 * SECOND
+_SYSTEMS = {'detections': 'obstacle', 'snapshot': 'bathymetry'}
+Record = dict[str, Any]
+"""What a reader says of a ping or a picture; see `xtf.pings_of`."""
+
+
+class Message(NamedTuple):
+    """A message to be written."""
+
+    topic: str
+    content: Any
+
+
+@define
+class Frame:
+    """Metres from the first position. missing: pings without a position; beyond: the first of
+    those with another one than is on Earth."""
+
+    frame_id: str = 'map'
+    origin: Origin | None = None
+    missing: int = 0
+    beyond: str = ''
+    last_ns: int = -1
+    leaps: Leaps = Factory(Leaps)
+
+    def navigation(self, record: Record) -> Navigation | None:
+        """Where the ship was at a ping; None where the file does not say."""
+        east, north = (float(value) for value in record['place'])
+        geodetic = record['units'] == 'degrees'
+        known = all(map(math.isfinite, (east, north, record['heading'])))
+        on_earth = abs(east) <= 180.0 and abs(north) <= 90.0 and (east or north)
+        if not (known and record['units'] and (on_earth or not geodetic)):
+            self.missing += 1
+            if known and geodetic and (east or north):
+                self.beyond = self.beyond or f'latitude {north:g}, longitude {east:g}'
+            return None
+        if geodetic:
+            self.origin = self.origin or Origin(north, east)
+            east, north = self.origin.local(north, east)[:2].tolist()
+        self.leaps.saw(record['stamp_ns'], east, north)
+        depth, pitch, roll = (
+            value if math.isfinite(value) else 0.0
+            for value in (record['depth'], record['pitch'], record['roll'])
+        )
+        # ENU from FLU, of degrees from north to the east, bow up, starboard down.
+        angles = roll, -pitch, 90.0 - record['heading']
+        return Navigation(
+            stamp_ns=record['stamp_ns'],
+            position=[east, north, -depth],
+            orientation=quaternion(*map(math.radians, angles)),
+            frame_id=self.frame_id,
+        )
+
+    def parameters(self) -> dict[str, list[float]]:
+        """The origin as a parameter of nodes; nothing for places in metres."""
+        if (place := self.origin) is None:
+            return {}
+        return origin_parameters((place.latitude, place.longitude, 0.0))
+
+    def tell(self, path: Path, report: ConversionReport) -> None:
+        """Report the origin, and what is missing or looks wrong."""
+        if self.missing:
+            report.problems.append(
+                f'{path.name}: {self.missing} pings have no position '
+                f'({self.beyond or "0, 0"} is none); they have no navigation'
+            )
+        self.leaps.tell(path, report)
+        if place := self.origin:
+            report.notes['origin'] = f'latitude {place.latitude!r}, longitude {place.longitude!r}'
+
+
+def ground_message(ping: Record, offset: np.ndarray) -> Message:
+    """The soundings of a ping; offset (n, 3): metres east, north and up of where the ship is.
+    Raises `Rejection`."""
+    nav = ping['nav']
+    if nav is None:
+        raise Rejection('no_position', 'its soundings have no position of the ship')
+    ground = Ground(
+        stamp_ns=ping['stamp_ns'],
+        position=nav.position + offset,
+        variance=np.zeros(len(offset)),
+        frame_id=nav.frame_id,
+    )
+    return Message('/ground', write_ground(ground, ros_message))
+
+
+def write_records(
+    path: Path,
+    records: Iterator[Record],
+    report: ConversionReport,
+    how: Any,
+    messages: Any,
+    parameters: dict[str, dict[str, Any]] | None = None,
+) -> None:
+    """Write the messages of each record and where the ship was. Raises `BagError` when there is
+    none."""
+    frame = Frame()
+    notes = provenance(path.name, report.notes)
+    own = {} if parameters is None else parameters
+    with BagWriter(report.path, storage=how.storage, custom_data=notes, parameters=own) as bag:
+        for record in _in_time(records, path, report):
+            stamp_ns = record['stamp_ns']
+            nav, made = None, []
+            with report.leaving_out(path, record['where']):
+                nav = frame.navigation(record)
+                with np.errstate(invalid='ignore'):  # of NaN, which the measurements reject
+                    made = list(messages({**record, 'nav': nav}))
+            if made and nav is not None and stamp_ns != frame.last_ns:
+                frame.last_ns = stamp_ns
+                made = [*navigation_messages(record, nav), *made]
+            for message in made:
+                bag.write(message.topic, message.content, stamp_ns)
+                report.messages[message.topic] += 1
+        if place := frame.parameters():
+            for topic in report.messages:
+                if system := _SYSTEMS.get(topic.rpartition('/')[2]):
+                    own[system] = {**own.get(system, {}), **place}
+        if not set(report.messages) - {'/nav', '/altitude'}:
+            raise report.nothing(path)
+    frame.tell(path, report)
+
+
+def navigation_messages(record: Record, navigation: Navigation) -> Iterator[Message]:
+    """Yield where the ship was and, if the record states it, its altitude."""
+    yield Message('/nav', write_navigation(navigation, ros_message))
+    altitude = float(record['altitude'])
+    if altitude > 0.0 and math.isfinite(altitude):
+        measured = Altitude(stamp_ns=record['stamp_ns'], altitude=altitude, frame_id='sonar')
+        yield Message('/altitude', write_range(measured, ros_message))
+
+
+def _in_time(records: Iterator[Record], path: Path, report: ConversionReport) -> Iterator[Record]:
+    """The records whose clock can be believed: near that of the one before, or of the next."""
+    last, held = None, None
+
+    def lonely(record: Record) -> None:
+        report.bad_row(path, record['where'], BadRow('its clock is off', 'clock off'))
+
+    for record in records:
+        stamp_ns = record['stamp_ns']
+        if not 0 < stamp_ns < LATEST:
+            report.bad_row(path, record['where'], BadRow('it has no time', 'no time'))
+            continue
+        if last is None or abs(stamp_ns - last) <= JUMP:
+            if held is not None:
+                lonely(held)
+        elif held is not None and abs(stamp_ns - held['stamp_ns']) <= JUMP:
+            report.problems.append(
+                f'{path.name}, {held["where"]}: the clock jumps by '
+                f'{(held["stamp_ns"] - last) / SECOND:g} s and stays there'
+            )
+            yield held
+        else:
+            if held is not None:
+                lonely(held)
+            held = record
+            continue
+        last, held = stamp_ns, None
+        yield record
+    if held is not None:
+        lonely(held)
+
+
+def speed_of(ping: Record) -> float:
+    stated = float(ping['sound_speed'])
+    return stated if SOUND_SPEEDS[0] <= stated <= SOUND_SPEEDS[1] else 1500.0
+
 
 ARRAYS: dict[str, tuple[str, ...]] = {
     'latitude': ('latitude', 'lat'),
@@ -145,15 +325,12 @@ def _messages(
 ) -> Iterator[Stamped]:
     """Yield the messages of each record; what cannot be used is counted."""
     for k, record in enumerate(records):
-        try:
+        navigation = None
+        with report.leaving_out(path, f'pose {k}'):
             navigation = frame.navigation(record)
-        except (Rejection, BadRow) as error:
-            report.bad_row(path, f'pose {k}', error)
-            continue
-        if navigation is None:
-            continue
-        for message in navigation_messages(record, navigation):
-            yield record['stamp_ns'], message.topic, message.content
+        if navigation is not None:
+            for message in navigation_messages(record, navigation):
+                yield record['stamp_ns'], message.topic, message.content
     frame.tell(path, report)
 
 

@@ -202,12 +202,6 @@ def _tell_zone(log: _Log, path: Path, report: ConversionReport) -> None:
         )
 
 
-def _talkers(path: Path) -> Counter[str]:
-    """How many sentences each talker says of the place of the receiver."""
-    found = (OWN.search(line) for _, line in _lines(path))
-    return Counter(match[1] for match in found if match)
-
-
 def _read(path: Path, report: ConversionReport, how: NmeaOptions) -> _Log:
     try:
         import pyais
@@ -216,7 +210,8 @@ def _read(path: Path, report: ConversionReport, how: NmeaOptions) -> _Log:
         raise BagError(
             "logs of NMEA sentences need pyais and pynmea2: pip install 'sonar_imm[nmea]'"
         ) from None
-    talkers = _talkers(path)
+    said = (OWN.search(line) for _, line in _lines(path))
+    talkers = Counter(match[1] for match in said if match)
     log = _Log(_day(how.date), talkers=talkers)
     if how.talker and how.talker not in talkers:
         raise BagError(
@@ -237,9 +232,9 @@ def _read(path: Path, report: ConversionReport, how: NmeaOptions) -> _Log:
             sentence = found['sentence']
             head = sentence[1:].partition(',')[0]
             if head in USBL:
-                _take_usbl(log, pynmea2.NMEASentence.checksum, sentence, stamp)
+                _take_usbl(log, sentence, stamp)
             elif head[2:] == 'THS':  # which pynmea2 does not know
-                _, degrees, mode = _fields(pynmea2.NMEASentence.checksum, sentence)[:3]
+                _, degrees, mode = _fields(sentence)[:3]
                 log.clock = stamp or log.clock
                 if mode == 'V':
                     raise BadRow('is flagged as invalid', 'flagged invalid')
@@ -423,9 +418,7 @@ def _take_heading(log: _Log, degrees: float, roll: float = 0.0, pitch: float = 0
     angles = [math.radians(angle) for angle in (*level, 90.0 - degrees)]
     log.headings.append(
         VesselHeading(
-            stamp_ns=stamp_ns,
-            orientation=np.array(quaternion(*angles)),
-            frame_id='vessel',
+            stamp_ns=stamp_ns, orientation=np.array(quaternion(*angles)), frame_id='vessel'
         )
     )
 
@@ -452,22 +445,22 @@ def _take_target(log: _Log, away: FloatArray, name: str) -> None:
     log.targets.append(row | {'id': name})
 
 
-def _fields(checksum: Callable[[str], int], sentence: str) -> list[str]:
+def _fields(sentence: str) -> list[str]:
     """The fields of a sentence, its name first. Raises `BadRow`."""
+    from pynmea2 import NMEASentence
+
     body, _, stated = sentence[1:].strip().rpartition('*')
-    if checksum(body) != int(stated, 16):
+    if NMEASentence.checksum(body) != int(stated, 16):
         raise BadRow('has another checksum than it states')
     return body.split(',')
 
 
-def _take_usbl(
-    log: _Log, checksum: Callable[[str], int], sentence: str, stamp: int | None
-) -> None:
+def _take_usbl(log: _Log, sentence: str, stamp: int | None) -> None:
     """What a USBL says: ``USRTH`` the true bearing, elevation and slant range of a target,
     ``PSIMSSB`` its place ahead and to starboard, and its depth, ``PSIMSNS`` how the vessel lies,
     roll positive to starboard and pitch positive with the bow up. Raises `BadRow`."""
     log.hears = True
-    head, *fields = _fields(checksum, sentence)
+    head, *fields = _fields(sentence)
     if head == 'USRTH':
         log.clock = stamp or log.clock
         distance = float(fields[3])

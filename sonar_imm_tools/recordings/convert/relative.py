@@ -152,15 +152,8 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
         known['tags'] = list(dict.fromkeys(tags.values()))
         numbers = tag_numbers(known['tags'])
         report.target_names = {name: numbers[tag] for name, tag in tags.items()}
-    write_bag(
-        report.path,
-        records,
-        report,
-        source=path.name,
-        storage=how.storage,
-        parameters={'diver': known},
-        streams=by_name((row.name, row.stamp_ns) for row in rows),
-    )
+    streams = by_name((row.name, row.stamp_ns) for row in rows)
+    write_bag(report, records, path, how, {'diver': known}, streams)
 
 
 def _pose(

@@ -31,11 +31,11 @@ from numpy.typing import NDArray
 from msg_adapters.array_records import write_trace
 from sonar_imm.acoustics.envelopes import is_envelope
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import Rejection, Trace
+from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm.trackers.fathometer.water import measure_line
 
-from ..conversion import ConversionReport, Record, write_bag
+from ..conversion import ConversionReport, converter, Record, write_bag
 from ..convert_options import SegyOptions
 from ..messages import ros_message
 from ..positions import write_position
@@ -49,15 +49,14 @@ _RUNS, _RUN = 10, 60
 """Stretches of successive traces that are looked at, and how many each has."""
 
 
-def convert_segy(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+@converter(SegyOptions)
+def convert_segy(path: Path, how: SegyOptions, report: ConversionReport) -> None:
     """Convert a SEG-Y file to the topic ``/trace``, and ``/position`` where it states places.
 
-    values: as in `SegyOptions`. Without sample_spacing the sample interval and sound_speed say it.
-    A stack of traces has the stamp of the last. For envelopes the bag gets ``parameters.yaml``.
-    Raises `BagError`, and ModuleNotFoundError without segyio.
+    Without sample_spacing the sample interval and sound_speed say it. A stack of traces has the
+    stamp of the last. For envelopes the bag gets ``parameters.yaml``. Raises `BagError`, and
+    ModuleNotFoundError without segyio.
     """
-    how = SegyOptions(**values)
-    report = ConversionReport(Path(out))
     line = read_segy(path, **{name: getattr(how, name) for name in READ_OPTIONS})
     report.problems += line.problems
     report.questions += line.questions
@@ -85,18 +84,11 @@ def convert_segy(path: str | Path, out: str | Path, **values: Any) -> Conversion
         noise = sigma
         if sigma is not None and window is not usual:
             noise = np.interp(window.depth(line), usual.depth(line), sigma)
-        records += _records(report, Path(path), line, window, noise, how)
+        records += _records(report, path, line, window, noise, how)
     if records:
         beside = navigation_of_table(how.nav, how.nav_options, report, on_earth=True)
         records += beside or _positions(line)
-    return write_bag(
-        out,
-        records,
-        report,
-        source=Path(path).name,
-        storage=how.storage,
-        parameters={'fathometer': own},
-    )
+    write_bag(report, records, path, how, {'fathometer': own})
 
 
 class Window(NamedTuple):
@@ -199,7 +191,7 @@ def _records(
         report.rows += how.stack
         rows = slice(first, first + how.stack)
         stamp = line.stamps[rows.stop - 1]
-        try:
+        with report.leaving_out(path, f'trace {first}'):
             trace = Trace(
                 stamp_ns=stamp,
                 frame_id=how.frame_id,
@@ -207,10 +199,7 @@ def _records(
                 amplitude=line.amplitude[rows, window.samples].mean(axis=0),
                 sigma=sigma,
             )
-        except Rejection as error:
-            report.bad_row(path, f'trace {first}', error)
-            continue
-        records.append((stamp, '/trace', write_trace(trace, ros_message)))
+            records.append((stamp, '/trace', write_trace(trace, ros_message)))
     return records
 
 
@@ -220,22 +209,13 @@ def measured_instrument(
     """Standard deviation of the pulse, m, and noise (n,), rms, of envelopes (T, n) with samples
     `spacing` m apart, of which `stack` successive ones are averaged; None when too few traces have
     a floor that stands free."""
-    tables = measure_line(_stretches(_stacked(amplitude, stack)), spacing)
+    T = len(amplitude) // stack
+    stacked = amplitude[: T * stack].reshape(T, stack, -1).mean(axis=1)
+    if T > _RUNS * _RUN:  # some stretches of successive traces, all along the line
+        begin = np.linspace(0, T - _RUN, _RUNS).astype(np.int64)
+        stacked = stacked[(begin[:, None] + np.arange(_RUN)).ravel()]
+    tables = measure_line(stacked, spacing)
     return (spacing * tables.pulse, tables.noise) if tables.pulse > 0.0 else None
-
-
-def _stretches(amplitude: FloatArray) -> FloatArray:
-    """Of many traces (T, n) some stretches of successive ones, all along the line."""
-    T = len(amplitude)
-    if T <= _RUNS * _RUN:
-        return amplitude
-    begin = np.linspace(0, T - _RUN, _RUNS).astype(np.int64)
-    return amplitude[(begin[:, None] + np.arange(_RUN)).ravel()]
-
-
-def _stacked(amplitude: FloatArray, stack: int) -> FloatArray:
-    count = len(amplitude) // stack
-    return np.asarray(amplitude[: count * stack].reshape(count, stack, -1).mean(axis=1))
 
 
 def doubted_spacing(

@@ -37,7 +37,7 @@ from ..tables import Row
 from ..times import BadRow
 from ..xtf import pings_in
 from .bag_images import SYSTEM
-from .sonar_files import ground_message, Message, Record, speed_of, write_records
+from .navigation import ground_message, Message, Record, speed_of, write_records
 
 LOOKS = {'starboard': -90.0, 'port': 90.0}
 """Where side scan looks, degrees to port of ahead."""

@@ -42,7 +42,7 @@ from ..csv_writer import CsvWriter
 from ..positions import Positions
 from ..segy_lines import opened_for_change, READ_OPTIONS, read_segy, SegyLine
 from ..sources import BagError
-from .points import wkt_of
+from .points import places_of
 
 _COPIED = ('existence', 'is_bottom', 'multiple_probability')
 
@@ -194,12 +194,7 @@ def _projected(picks: Picks, epsg: int | None) -> tuple[FloatArray, FloatArray]:
         return x, y
     if not there.any():
         raise BagError('the recording has no positions (sensor_msgs/NavSatFix) to give in x and y')
-    from rasterio.warp import transform
-
-    wkt = wkt_of(epsg)
-    x[there], y[there] = transform(
-        'EPSG:4326', wkt, picks.longitude[there].tolist(), picks.latitude[there].tolist()
-    )
+    x[there], y[there] = places_of(picks.longitude[there], picks.latitude[there], epsg)
     return x, y
 
 

@@ -235,6 +235,7 @@ def write_las(path: Path, points: Points, epsg: int | None) -> None:
     """
     import laspy
     from laspy.header import GpsTimeType
+    from laspy.vlrs.known import WktCoordinateSystemVlr
 
     header = laspy.LasHeader(point_format=6, version='1.4')
     header.scales = np.full(3, SCALE)
@@ -242,7 +243,9 @@ def write_las(path: Path, points: Points, epsg: int | None) -> None:
     header.offsets = np.round(first)
     header.add_extra_dims([laspy.ExtraBytesParams(name, np.float32) for name in _LAS_EXTRAS])
     if epsg is not None:
-        _add_crs(header, epsg)
+        # As text, as LAS 1.4 wants it.
+        header.vlrs.append(WktCoordinateSystemVlr(wkt_of(epsg)))
+        header.global_encoding.wkt = True
     las = laspy.LasData(header)
     las.x, las.y, las.z = (points[name] for name in 'xyz')
     weakest = points['intensity'].min() if len(points) else 0.0
@@ -260,14 +263,6 @@ def write_las(path: Path, points: Points, epsg: int | None) -> None:
     for name in _LAS_EXTRAS:
         las[name] = points[name].astype(np.float32)
     las.write(str(path))
-
-
-def _add_crs(header: object, epsg: int) -> None:
-    """The coordinate system as text, as LAS 1.4 wants it."""
-    from laspy.vlrs.known import WktCoordinateSystemVlr
-
-    header.vlrs.append(WktCoordinateSystemVlr(wkt_of(epsg)))  # type: ignore[attr-defined]
-    header.global_encoding.wkt = True  # type: ignore[attr-defined]
 
 
 def wkt_of(epsg: int) -> str:

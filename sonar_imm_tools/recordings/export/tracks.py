@@ -313,10 +313,7 @@ def _write_xml(path: Path, root: ElementTree.Element) -> None:
 
 
 def write_obstacles(
-    path: Path,
-    landmarks: Sequence[dict[str, Any]],
-    epsg: int,
-    origin: tuple[float, float, float],
+    path: Path, landmarks: Sequence[dict[str, Any]], epsg: int, origin: tuple[float, float, float]
 ) -> None:
     """Points (RFC 7946), the third coordinate the height in the frame of the navigation.
 

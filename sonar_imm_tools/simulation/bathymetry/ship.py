@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 from attrs import frozen
 import numpy as np
+from numpy.random import Generator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -140,7 +141,7 @@ class Ship(NamedTuple):
         return Pose(position, geometry.rotation(*angles))
 
 
-def ship_of(config: ShipScenario, sonar_depth: float, rng: np.random.Generator) -> Ship:
+def ship_of(config: ShipScenario, sonar_depth: float, rng: Generator) -> Ship:
     """A ship whose array is `sonar_depth` below the water line on average."""
     course = math.radians(config.course_deg)
 
@@ -163,12 +164,7 @@ def ship_of(config: ShipScenario, sonar_depth: float, rng: np.random.Generator) 
 
 
 def navigation_of(
-    config: ShipScenario,
-    ship: Ship,
-    first_ns: int,
-    seconds: float,
-    rng: np.random.Generator,
-    frame_id: str,
+    config: ShipScenario, ship: Ship, first_ns: int, seconds: float, rng: Generator, frame_id: str
 ) -> list[Navigation]:
     """What the ship's navigation says from a second before time zero, at `first_ns`, to a second
     after `seconds`."""
@@ -197,7 +193,7 @@ def navigation_of(
     ]
 
 
-def _slow(rng: np.random.Generator, count: int, width: float) -> FloatArray:
+def _slow(rng: Generator, count: int, width: float) -> FloatArray:
     """Smooth noise (count, 6) of unit variance."""
     white = rng.normal(size=(count + 8 * math.ceil(width), 6))
     smooth = gaussian_filter1d(white, width, axis=0, mode='wrap')

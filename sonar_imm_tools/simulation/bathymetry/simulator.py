@@ -22,14 +22,13 @@ strong burst of noise, incoherent across the array.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 import math
 from typing import Any
 
 from attrs import evolve, frozen
 import numpy as np
+from numpy.random import Generator
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 
 from sonar_imm.acoustics import array, geometry, rays, sounding
 from sonar_imm.estimation.arrays import BoolArray, ComplexArray, FloatArray
@@ -37,13 +36,13 @@ from sonar_imm.measurements import Snapshot
 from sonar_imm.parameters import parameter
 from sonar_imm.truth import Received, Scene, TrueProfile
 
+from ..scenario import FIRST_STAMP_NS, lasting, Scenarios
 from .objects import above, Facets, facets_of, OBJECTS, second_of, surfaces_of
 from .ship import in_outline, navigation_of, see, Ship, ship_of, ShipScenario, Terrain
 
 SIDES = ('starboard', 'port', 'both')
 LAWS = ('laplace', 'gaussian', 'k')
 ROUGHNESS_LAWS = ('gaussian', 'laplace', 'fractal', 'exponential')
-FIRST_STAMP_NS = 1_700_000_000_000_000_000
 
 
 @frozen(kw_only=True)
@@ -163,76 +162,48 @@ class BathymetryScenario(ShipScenario):
 SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)
 """Depth and sound speed of a shallow sea in summer."""
 _UNDER_WAY: dict[str, Any] = {
-    'moving': True,
-    'pings': 24,
-    'ping_rate': 2.0,
-    'sonar_depth': 5.0,
-    'patch_along': (8.0, 20.0),
-    'patch_outline': 1.0,
-    'nav_attitude_error_deg': 0.05,
-    'nav_heading_error_deg': 0.1,
-    'nav_heave_error': 0.05,
-    'nav_position_error': 0.1,
-}
+    'moving': True, 'pings': 24, 'ping_rate': 2.0, 'sonar_depth': 5.0, 'patch_along': (8.0, 20.0),
+    'patch_outline': 1.0, 'nav_attitude_error_deg': 0.05, 'nav_heading_error_deg': 0.1,
+    'nav_heave_error': 0.05, 'nav_position_error': 0.1,
+}  # fmt: skip
 
-SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
+# fmt: off
+SCENARIOS: Scenarios = {
     'paper': ('flat floor with a rough patch, 30 to 10 dB: the scene of the paper', {}),
     'slope': ('paper on a floor that rises 0.1 m per metre', {'slope': 0.1}),
-    'correlated': (
-        'paper with roughness correlated over a metre, as real roughness is',
-        {'correlation_length': 1.0},
-    ),
-    'undulating': (
-        'paper on an undulating floor',
-        {'undulation_height': 0.5, 'undulation_length': 15.0},
-    ),
+    'correlated': ('paper with roughness correlated over a metre, as real roughness is',
+        {'correlation_length': 1.0}),
+    'undulating': ('paper on an undulating floor',
+        {'undulation_height': 0.5, 'undulation_length': 15.0}),
     'shadow': ('paper with two shadows', {'shadows': (30.0, 33.0, 58.0, 63.0)}),
     'spikes': ('paper with a burst of noise in every tenth bin', {'spike_probability': 0.1}),
     'multipath': ('paper under a calm surface', {'multipath': True}),
-    'water_column': (
-        'paper from 5 m on, so that the noise is heard and need not be stated',
-        {'first_range': 5.0, 'state_noise': False},
-    ),
+    'water_column': ('paper from 5 m on, so that the noise is heard and need not be stated',
+        {'first_range': 5.0, 'state_noise': False}),
     'gaussian': ('paper with Gaussian echoes', {'law': 'gaussian'}),
     'thermal': ('paper with noise that does not fade with the echo', {'noise_fades': False}),
-    'foreign': (
-        'paper under other laws than the tracker supposes: fractal roughness, echoes with heavier '
-        'tails, noise that does not fade',
-        {'noise_fades': False, 'law': 'k', 'roughness_law': 'fractal'},
-    ),
-    'ledge': (
-        'a step of 2 m, which answers at the same ranges as the floor; noise that does not fade',
-        {'object': 'ledge', 'noise_fades': False},
-    ),
-    'moving_ledge': (
-        'ledge below a ship under way in a swell',
-        {**_UNDER_WAY, 'object': 'ledge', 'noise_fades': False},
-    ),
+    'foreign': ('paper under other laws than the tracker supposes: fractal roughness, echoes with '
+        'heavier tails, noise that does not fade',
+        {'noise_fades': False, 'law': 'k', 'roughness_law': 'fractal'}),
+    'ledge': ('a step of 2 m, which answers at the same ranges as the floor; noise that does not '
+        'fade',
+        {'object': 'ledge', 'noise_fades': False}),
+    'moving_ledge': ('ledge below a ship under way in a swell',
+        {**_UNDER_WAY, 'object': 'ledge', 'noise_fades': False}),
     'two_sides': ('paper on both sides of the ship', {'side': 'both'}),
-    'moving': (
-        'a ship under way in a swell, with navigation and its errors; a rough patch with a wavy '
-        'outline',
-        {**_UNDER_WAY},
-    ),
-    'moving_profile': (
-        'moving in summer, when sound bends by metres at the end of the swath',
-        {**_UNDER_WAY, 'sonar_depth': 5.0, 'sound_speed_profile': SUMMER},
-    ),
-    'moving_two_sides': (
-        'moving, on both sides of the ship',
-        {**_UNDER_WAY, 'side': 'both'},
-    ),
-    'drifting_patch': (
-        'paper with a patch that lies further out each ping',
-        {'pings': 60, 'patch_drift': 0.2, 'patch_start': 32.0, 'patch_end': 42.0},
-    ),
+    'moving': ('a ship under way in a swell, with navigation and its errors; a rough patch with a '
+        'wavy outline',
+        {**_UNDER_WAY}),
+    'moving_profile': ('moving in summer, when sound bends by metres at the end of the swath',
+        {**_UNDER_WAY, 'sonar_depth': 5.0, 'sound_speed_profile': SUMMER}),
+    'moving_two_sides': ('moving, on both sides of the ship', {**_UNDER_WAY, 'side': 'both'}),
+    'drifting_patch': ('paper with a patch that lies further out each ping',
+        {'pings': 60, 'patch_drift': 0.2, 'patch_start': 32.0, 'patch_end': 42.0}),
 }
+# fmt: on
 """Name: (what it is, what differs from the defaults of `BathymetryScenario`)."""
 
-
-def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> BathymetryScenario:
-    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
-    return BathymetryScenario.named(name, SCENARIOS, overrides)
+scenario = BathymetryScenario.among(SCENARIOS)
 
 
 def simulate(config: BathymetryScenario, seed: int) -> Scene:
@@ -283,7 +254,7 @@ def _floor(
     config: BathymetryScenario,
     ping: int,
     ranges: FloatArray,
-    rng: np.random.Generator,
+    rng: Generator,
     stamp_ns: int,
     side: str,
     namespace: str,
@@ -378,7 +349,7 @@ def _floor_below(
     ship: Ship,
     since_start: float,
     ranges: FloatArray,
-    rng: np.random.Generator,
+    rng: Generator,
     side: str,
     namespace: str,
 ) -> TrueProfile:
@@ -435,7 +406,7 @@ def _lit(config: BathymetryScenario, ranges: FloatArray) -> BoolArray:
     return lit
 
 
-def _roughness(config: BathymetryScenario, bins: int, rng: np.random.Generator) -> FloatArray:
+def _roughness(config: BathymetryScenario, bins: int, rng: Generator) -> FloatArray:
     if config.roughness_law == 'laplace':
         white = rng.laplace(scale=math.sqrt(0.5), size=bins)
     else:
@@ -449,9 +420,7 @@ def _roughness(config: BathymetryScenario, bins: int, rng: np.random.Generator) 
         white /= white.std()
     width = config.correlation_length / config.bin_width
     if width > 0.0 and config.roughness_law == 'exponential':
-        kept = math.exp(-1.0 / width)
-        white[1:] *= math.sqrt(1.0 - kept * kept)
-        white = lfilter([1.0], [1.0, -kept], white)
+        white = lasting(white, math.exp(-1.0 / width))
     elif width > 0.0:
         smooth = gaussian_filter1d(white, width, mode='wrap')
         kernel = gaussian_filter1d(np.eye(1, bins, bins // 2)[0], width, mode='wrap')
@@ -468,10 +437,7 @@ def snr(config: BathymetryScenario, ranges: FloatArray) -> FloatArray:
 
 
 def hear(
-    config: BathymetryScenario,
-    floor: TrueProfile,
-    rng: np.random.Generator,
-    facets: Facets | None = None,
+    config: BathymetryScenario, floor: TrueProfile, rng: Generator, facets: Facets | None = None
 ) -> Snapshot:
     """The samples of the staves for one ping over a floor, or from its facets."""
     bins = len(floor.range)
@@ -514,7 +480,7 @@ def hear(
 
 
 def _of_facets(
-    config: BathymetryScenario, bins: int, facets: Facets, rng: np.random.Generator
+    config: BathymetryScenario, bins: int, facets: Facets, rng: Generator
 ) -> ComplexArray:
     """The echoes (T, P) of facets, each surface of a bin with a texture of its own."""
     texture = np.stack([_fading(config, bins, rng) for _ in range(4)])
@@ -531,7 +497,7 @@ def _speed_at_array(config: BathymetryScenario) -> float:
     return float(rays.profile_of(config.sound_speed_profile).at(config.sonar_depth))
 
 
-def _echo(config: BathymetryScenario, sine: FloatArray, rng: np.random.Generator) -> ComplexArray:
+def _echo(config: BathymetryScenario, sine: FloatArray, rng: Generator) -> ComplexArray:
     """Plane waves (n, P) of unit power from direction sines (n,), less what differs from stave to
     stave."""
     vectors = array.steering(
@@ -545,13 +511,13 @@ def _echo(config: BathymetryScenario, sine: FloatArray, rng: np.random.Generator
     return math.sqrt(1.0 - share) * wave + math.sqrt(share) * own
 
 
-def _fading(config: BathymetryScenario, bins: int, rng: np.random.Generator) -> FloatArray:
+def _fading(config: BathymetryScenario, bins: int, rng: Generator) -> FloatArray:
     """The power z (n,) of echoes, one on average."""
     if config.law == 'k':
         return rng.gamma(config.texture_shape, 1.0 / config.texture_shape, size=bins)
     return rng.exponential(size=bins) if config.law == 'laplace' else np.ones(bins)
 
 
-def _circular(rng: np.random.Generator, *shape: int) -> ComplexArray:
+def _circular(rng: Generator, *shape: int) -> ComplexArray:
     """Circular complex Gaussian numbers of unit variance."""
     return rng.normal(size=(*shape, 2)).view(np.complex128)[..., 0] * math.sqrt(0.5)

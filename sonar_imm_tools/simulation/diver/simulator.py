@@ -16,11 +16,12 @@ heading ("zigzag with general consistent direction" in the paper).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from attrs import evolve, frozen
 import numpy as np
+from numpy.random import Generator
 
 from sonar_imm.acoustics.localisation import Localisation, localise
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
@@ -30,33 +31,23 @@ from sonar_imm.measurements import Arrivals, Fix
 from sonar_imm.parameters import parameter
 from sonar_imm.truth import Received, Scene, TrueTrack
 
-from ..scenario import Scenario
-from .afloat import (
-    GEODETIC,
+from ..scenario import delay_ns, Scenario, Scenarios, stamps_of
+from .fixes import (
+    crossing_paths,
     instruments_of_places,
+    instruments_of_scans,
     namespace_of,
     sense_from_vessel,
     sense_geodetic,
-    USBL,
+    sense_scan,
 )
-from .crossing import CROSSING, crossing_paths, instruments_of_scans, sense_scan
 
 MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still', 'crossing')
-SENSORS = (
-    'polar',
-    'positions',
-    'multistatic_fixes',
-    'arrivals',
-    'scans',
-    'geodetic',
-    'usbl',
-)
+SENSORS = ('polar', 'positions', 'multistatic_fixes', 'arrivals', 'scans', 'geodetic', 'usbl')
 
 TRANSMITTER = np.array([0.0, 0.0, 0.0])
 RECEIVERS = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
 """One transmitter that also listens, and three receivers, metres."""
-
-FIRST_STAMP_NS = 1_700_000_000_000_000_000
 
 
 @frozen(kw_only=True)
@@ -154,109 +145,65 @@ class DiverScenario(Scenario):
 
 
 MULTISTATIC = {
-    'sensor': 'arrivals',
-    'speed': 0.75,
-    'detection_probability': 0.7,
-    'outlier_probability': 0.02,
+    'sensor': 'arrivals', 'speed': 0.75, 'detection_probability': 0.7, 'outlier_probability': 0.02,
     'random_rotation': True,
-}
+}  # fmt: skip
 
-SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
+# fmt: off
+SCENARIOS: Scenarios = {
     'table1': ('zigzag legs at 1 m/s, polar sonar: Table 1 of the paper', {}),
-    'random_heading': (
-        'table1 turned about the sonar by a random angle: no heading is a model',
-        {'random_rotation': True},
-    ),
+    'random_heading': ('table1 turned about the sonar by a random angle: no heading is a model',
+        {'random_rotation': True}),
     'legs_slow': ('table1 at 0.5 m/s', {'speed': 0.5}),
-    'straight': (
-        'a straight cruise, turned at random',
-        {'motion': 'straight', 'random_rotation': True},
-    ),
+    'straight': ('a straight cruise, turned at random',
+        {'motion': 'straight', 'random_rotation': True}),
     'circle': ('a circle once every 80 s at 0.75 m/s', {'motion': 'circle', 'speed': 0.75}),
-    'zigzag': (
-        '60 degrees to either side in turn, every 10 s',
-        {
-            'motion': 'zigzag',
-            'turn_deg': 60.0,
-            'leg_min': 10.0,
-            'leg_max': 10.0,
-            'speed': 0.75,
-            'random_rotation': True,
-        },
-    ),
-    'stop_and_go': (
-        'legs with rests between',
-        {'motion': 'stop_and_go', 'speed': 0.75, 'random_rotation': True},
-    ),
+    'zigzag': ('60 degrees to either side in turn, every 10 s',
+        {'motion': 'zigzag', 'turn_deg': 60.0, 'leg_min': 10.0, 'leg_max': 10.0, 'speed': 0.75,
+         'random_rotation': True}),
+    'stop_and_go': ('legs with rests between',
+        {'motion': 'stop_and_go', 'speed': 0.75, 'random_rotation': True}),
     'still': ('a diver that does not move', {'motion': 'still'}),
-    'irregular': (
-        'table1, irregular scans, a quarter of them late',
-        {'step_jitter': 0.4, 'late_fraction': 0.25, 'detection_probability': 0.9},
-    ),
-    'multistatic': (
-        'raw arrival times at four receivers, some missing, some outliers',
-        MULTISTATIC,
-    ),
-    'multistatic_fixes': (
-        'fixes computed ping by ping from four receivers',
-        {'sensor': 'multistatic_fixes', 'speed': 0.75, 'random_rotation': True},
-    ),
-    'at_depth': (
-        'raw arrivals of a diver somewhere in 20 m of water, up and down with the swell',
-        {
-            **MULTISTATIC,
-            'depth': (1.0, 19.0),
-            'swell_height': 1.0,
-            'receiver_depths': (2.0, 5.0, 8.0, 12.0),
-        },
-    ),
-    'misplaced_receivers': (
-        'raw arrivals at receivers a metre off, with clocks and sound speed wrong too',
-        {
-            **MULTISTATIC,
-            'receiver_position_std': 1.0,
-            'receiver_clock_std': 5e-4,
-            'sound_speed_std': 5.0,
-        },
-    ),
-    'lasting_errors': (
-        'fixes whose errors last for a minute, as those of a filtered position source',
-        {
-            'sensor': 'positions',
-            'speed': 0.75,
-            'random_rotation': True,
-            'duration': 299.0,
-            'fix_std': 0.5,
-            'fix_bias_std': 1.0,
-        },
-    ),
-    'several': (
-        'four divers, missed detections and clutter',
-        {
-            'divers': 4,
-            'detection_probability': 0.9,
-            'clutter': 2.0,
-            'random_rotation': True,
-            'speed': 0.75,
-        },
-    ),
-    'crossing': CROSSING,
-    'usbl': USBL,
-    'geodetic': GEODETIC,
+    'irregular': ('table1, irregular scans, a quarter of them late',
+        {'step_jitter': 0.4, 'late_fraction': 0.25, 'detection_probability': 0.9}),
+    'multistatic': ('raw arrival times at four receivers, some missing, some outliers',
+        MULTISTATIC),
+    'multistatic_fixes': ('fixes computed ping by ping from four receivers',
+        {'sensor': 'multistatic_fixes', 'speed': 0.75, 'random_rotation': True}),
+    'at_depth': ('raw arrivals of a diver somewhere in 20 m of water, up and down with the swell',
+        {**MULTISTATIC, 'depth': (1.0, 19.0), 'swell_height': 1.0,
+         'receiver_depths': (2.0, 5.0, 8.0, 12.0)}),
+    'misplaced_receivers': ('raw arrivals at receivers a metre off, with clocks and sound speed '
+        'wrong too',
+        {**MULTISTATIC, 'receiver_position_std': 1.0, 'receiver_clock_std': 5e-4,
+         'sound_speed_std': 5.0}),
+    'lasting_errors': ('fixes whose errors last for a minute, as those of a filtered position '
+        'source',
+        {'sensor': 'positions', 'speed': 0.75, 'random_rotation': True, 'duration': 299.0,
+         'fix_std': 0.5, 'fix_bias_std': 1.0}),
+    'several': ('four divers, missed detections and clutter',
+        {'divers': 4, 'detection_probability': 0.9, 'clutter': 2.0, 'random_rotation': True,
+         'speed': 0.75}),
+    'crossing': ('two pairs of divers that cross within a metre, scans of fixes in clutter',
+        {'motion': 'crossing', 'sensor': 'scans', 'divers': 4, 'duration': 119.0,
+         'detection_probability': 0.9, 'fix_std': 0.7, 'clutter': 10.0, 'clutter_range': 80.0}),
+    'usbl': ('divers with transponders, located from a vessel that circles them',
+        {'sensor': 'usbl', 'divers': 2, 'speed': 0.75, 'start': (0.0, 0.0),
+         'depth': (5.0, 15.0)}),
+    'geodetic': ('fixes in latitude and longitude',
+        {'sensor': 'geodetic', 'speed': 0.75, 'random_rotation': True}),
 }
+# fmt: on
 """Name: (what it is, what differs from the defaults of `DiverScenario`)."""
 
-
-def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> DiverScenario:
-    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
-    return DiverScenario.named(name, SCENARIOS, overrides)
+scenario = DiverScenario.among(SCENARIOS)
 
 
 def simulate(config: DiverScenario, seed: int) -> Scene:
     """Run a scene. The same config and seed give the same scene."""
     rng = np.random.default_rng(seed)
     times = _scan_times(config, rng)
-    stamps = FIRST_STAMP_NS + np.round(times * 1e9).astype(np.int64)
+    stamps = stamps_of(times)
     turn = rng.uniform(0.0, 2.0 * np.pi) if config.random_rotation else 0.0
     if config.motion == 'crossing':
         paths = crossing_paths(config.divers, times, rng)
@@ -264,26 +211,20 @@ def simulate(config: DiverScenario, seed: int) -> Scene:
         paths = [_path(config, times, diver, turn, rng) for diver in range(config.divers)]
     errors = draw_errors(config, times, np.random.default_rng([seed, 1]))
     truth = tuple(
-        TrueTrack(
-            number,
-            stamps,
-            np.column_stack([state[:, :2], errors.height[:, number - 1]]),
-            state[:, 2:],
-        )
-        for number, state in enumerate(paths, start=1)
+        TrueTrack(number, stamps, np.column_stack([state[:, :2], height]), state[:, 2:])
+        for number, (state, height) in enumerate(zip(paths, errors.height.T), start=1)
     )
     received = []
     for k, stamp in enumerate(stamps):
         present = np.array([track.position[k] for track in truth])
-        delay = config.late_delay * rng.uniform() if rng.uniform() < config.late_fraction else 0.0
+        when = int(stamp) + delay_ns(config, rng)
         for measurement in SENSE[config.sensor](config, errors.at(k), int(stamp), present, rng):
-            when = int(stamp) + round(delay * 1e9)
             received.append(Received(when, measurement, namespace_of(measurement)))
     received.sort(key=lambda item: item.received_ns)
     return Scene(tuple(received), truth)
 
 
-def _scan_times(config: DiverScenario, rng: np.random.Generator) -> FloatArray:
+def _scan_times(config: DiverScenario, rng: Generator) -> FloatArray:
     times = np.arange(0.0, config.duration + 0.5 * config.step, config.step)
     jitter = 0.5 * config.step_jitter * config.step
     times[1:] += rng.uniform(-jitter, jitter, len(times) - 1)
@@ -291,12 +232,12 @@ def _scan_times(config: DiverScenario, rng: np.random.Generator) -> FloatArray:
 
 
 def _path(
-    config: DiverScenario, times: FloatArray, diver: int, turn: float, rng: np.random.Generator
+    config: DiverScenario, times: FloatArray, diver: int, turn: float, rng: Generator
 ) -> FloatArray:
     """State (n, 4), px py vx vy, of one diver at `times` in a scene turned by `turn` rad; the
     velocity is that of the step before."""
     general = np.deg2rad(config.heading_deg) + turn
-    velocity = _VELOCITY[config.motion](config, times, general, rng)
+    velocity = _velocity(config, times, general, rng)
     state = np.empty((len(times), 4))
     turned = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     start = turned @ (np.array(config.start) + config.spacing * _spiral(diver))
@@ -315,7 +256,7 @@ def _along(heading: FloatArray, speed: FloatArray | float) -> FloatArray:
     return np.column_stack([np.cos(heading), np.sin(heading)]) * np.reshape(speed, (-1, 1))
 
 
-def _leg_numbers(config: DiverScenario, times: FloatArray, rng: np.random.Generator) -> np.ndarray:
+def _leg_numbers(config: DiverScenario, times: FloatArray, rng: Generator) -> np.ndarray:
     """Which leg (n,) each time falls in."""
     ends = np.cumsum(
         rng.uniform(config.leg_min, config.leg_max, int(config.duration / config.leg_min) + 2)
@@ -323,56 +264,23 @@ def _leg_numbers(config: DiverScenario, times: FloatArray, rng: np.random.Genera
     return np.searchsorted(ends, times)
 
 
-def _legs(
-    config: DiverScenario, times: FloatArray, general: float, rng: np.random.Generator
+def _velocity(
+    config: DiverScenario, times: FloatArray, general: float, rng: Generator
 ) -> FloatArray:
+    """Velocity (n, 2) at each time of a diver whose general heading is `general` rad."""
+    turn, motion = np.deg2rad(config.turn_deg), config.motion
+    if motion == 'still':
+        return np.zeros((len(times), 2))
+    if motion == 'straight':
+        return _along(np.full(len(times), general), config.speed)
+    if motion == 'circle':
+        return _along(general + 2.0 * np.pi * times / 80.0, config.speed)
     leg = _leg_numbers(config, times, rng)
-    turn = np.deg2rad(config.turn_deg)
-    return _along((general + rng.uniform(-turn, turn, leg[-1] + 1))[leg], config.speed)
-
-
-def _straight(
-    config: DiverScenario, times: FloatArray, general: float, rng: np.random.Generator
-) -> FloatArray:
-    return _along(np.full(len(times), general), config.speed)
-
-
-def _circle(
-    config: DiverScenario, times: FloatArray, general: float, rng: np.random.Generator
-) -> FloatArray:
-    return _along(general + 2.0 * np.pi * times / 80.0, config.speed)
-
-
-def _zigzag(
-    config: DiverScenario, times: FloatArray, general: float, rng: np.random.Generator
-) -> FloatArray:
-    side = np.where(_leg_numbers(config, times, rng) % 2, -1.0, 1.0)
-    return _along(general + side * np.deg2rad(config.turn_deg), config.speed)
-
-
-def _stop_and_go(
-    config: DiverScenario, times: FloatArray, general: float, rng: np.random.Generator
-) -> FloatArray:
-    leg = _leg_numbers(config, times, rng)
-    turn = np.deg2rad(config.turn_deg)
+    if motion == 'zigzag':
+        return _along(general + np.where(leg % 2, -1.0, 1.0) * turn, config.speed)
     heading = (general + rng.uniform(-turn, turn, leg[-1] + 1))[leg]
-    return _along(heading, np.where(leg % 3 == 2, 0.0, config.speed))
-
-
-def _still(
-    config: DiverScenario, times: FloatArray, general: float, rng: np.random.Generator
-) -> FloatArray:
-    return np.zeros((len(times), 2))
-
-
-_VELOCITY = {
-    'legs': _legs,
-    'straight': _straight,
-    'circle': _circle,
-    'zigzag': _zigzag,
-    'stop_and_go': _stop_and_go,
-    'still': _still,
-}
+    rests = (leg % 3 == 2) & (motion == 'stop_and_go')
+    return _along(heading, np.where(rests, 0.0, config.speed))
 
 
 # -- what sensors make of it ----------------------------------------------------------------------
@@ -395,7 +303,7 @@ class Errors:
         return evolve(self, fix_bias=self.fix_bias[k])
 
 
-def draw_errors(config: DiverScenario, times: FloatArray, rng: np.random.Generator) -> Errors:
+def draw_errors(config: DiverScenario, times: FloatArray, rng: Generator) -> Errors:
     """What is drawn once for a scene, and the errors that last, at `times` (n,) s."""
     shallow, deep = config.depth
     depth = rng.uniform(shallow, deep, size=config.divers)
@@ -416,11 +324,7 @@ def draw_errors(config: DiverScenario, times: FloatArray, rng: np.random.Generat
 
 
 def _sense_polar(
-    config: DiverScenario,
-    errors: Errors,
-    stamp_ns: int,
-    present: FloatArray,
-    rng: np.random.Generator,
+    config: DiverScenario, errors: Errors, stamp_ns: int, present: FloatArray, rng: Generator
 ) -> list[Fix]:
     """Range and bearing from the origin, converted without bias; clutter uniform in the square."""
     seen = present[:, :2][rng.uniform(size=len(present)) < config.detection_probability]
@@ -438,23 +342,16 @@ def _sense_polar(
     bearings = np.arctan2(points[:, 1], points[:, 0]) + bearing_std * rng.normal(size=len(points))
     bearings += errors.bearing
     z, R = unbiased_polar_to_cartesian(ranges, bearings, config.range_std**2, bearing_std**2)
-    return [
-        Fix(
-            stamp_ns=stamp_ns,
-            position=np.append(position, 0.0),
-            covariance=covariance,
-            frame_id='map',
-        )
-        for position, covariance in zip(z, R)
-    ]
+    return [_fix(stamp_ns, place, covariance) for place, covariance in zip(z, R)]
+
+
+def _fix(stamp_ns: int, place: FloatArray, covariance: FloatArray, height: float = 0.0) -> Fix:
+    position = np.append(place, height)
+    return Fix(stamp_ns=stamp_ns, position=position, covariance=covariance, frame_id='map')
 
 
 def _sense_arrivals(
-    config: DiverScenario,
-    errors: Errors,
-    stamp_ns: int,
-    present: FloatArray,
-    rng: np.random.Generator,
+    config: DiverScenario, errors: Errors, stamp_ns: int, present: FloatArray, rng: Generator
 ) -> list[Arrivals]:
     """Echoes of one ping at every receiver."""
     receivers = RECEIVERS - np.outer(config.receiver_depths, [0.0, 0.0, 1.0])
@@ -500,7 +397,7 @@ def _paths(
     rx: FloatArray,
     misplaced: FloatArray,
     present: FloatArray,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> FloatArray:
     """Path lengths heard at one receiver, said to be at `rx` (3,) but `misplaced` (2,), metres:
     divers, some of them late by a reflection, and clutter."""
@@ -517,11 +414,7 @@ def _paths(
 
 
 def _sense_positions(
-    config: DiverScenario,
-    errors: Errors,
-    stamp_ns: int,
-    present: FloatArray,
-    rng: np.random.Generator,
+    config: DiverScenario, errors: Errors, stamp_ns: int, present: FloatArray, rng: Generator
 ) -> list[Fix]:
     """Positions with a white and a lasting error; the covariance states the white one."""
     seen = present[rng.uniform(size=len(present)) < config.detection_probability]
@@ -530,23 +423,12 @@ def _sense_positions(
     if config.fix_height_std:
         heights = seen[:, 2] + config.fix_height_std * rng.normal(size=len(seen))
         variances.append(config.fix_height_std**2)
-    return [
-        Fix(
-            stamp_ns=stamp_ns,
-            position=np.append(place, height),
-            covariance=np.diag(variances),
-            frame_id='map',
-        )
-        for place, height in zip(places, heights)
-    ]
+    white = np.diag(variances)
+    return [_fix(stamp_ns, place, white, height) for place, height in zip(places, heights)]
 
 
 def _sense_multistatic_fixes(
-    config: DiverScenario,
-    errors: Errors,
-    stamp_ns: int,
-    present: FloatArray,
-    rng: np.random.Generator,
+    config: DiverScenario, errors: Errors, stamp_ns: int, present: FloatArray, rng: Generator
 ) -> list[Fix]:
     """One fix per ping and diver, from its own echoes; none where the geometry gives none."""
     fixes = []
@@ -556,14 +438,7 @@ def _sense_multistatic_fixes(
                 ping.rx, ping.toa, ping.var_toa, tx=ping.tx, sound_speed=config.sound_speed
             )
             if isinstance(fix, Localisation):
-                fixes.append(
-                    Fix(
-                        stamp_ns=stamp_ns,
-                        position=np.append(fix.position, 0.0),
-                        covariance=fix.covariance,
-                        frame_id='map',
-                    )
-                )
+                fixes.append(_fix(stamp_ns, fix.position, fix.covariance))
     return fixes
 
 

@@ -15,11 +15,11 @@ largest value. The array drifts and heaves.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from attrs import frozen
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from sonar_imm.acoustics.fathometer import PROCESSORS
@@ -28,7 +28,7 @@ from sonar_imm.parameters import parameter
 from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm.truth import PRESENT
 
-from ..scenario import Scenario
+from ..scenario import Scenario, Scenarios
 
 LEVELS = ('csdm', 'response', 'trace', 'pressure', 'envelope')
 MOST_MEMORY = 2e9
@@ -181,97 +181,39 @@ class FathometerScenario(Scenario):
         return 8.0 * self.records * rows * self.phones**2
 
 
-SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
+# fmt: off
+SCENARIOS: Scenarios = {
     'drift': ('300 records of the drift of the paper, processed by MVDR: 2 s per record', {}),
-    'drift_conventional': (
-        'drift, processed conventionally',
-        {'processor': 'conventional', 'frequency_min': 200.0},
-    ),
-    'drift_spectra': (
-        'the first four records of a drift, as cross-spectra of 45 MB each',
-        {'level': 'csdm', 'records': 4, 'appearing': (), 'fading': ()},
-    ),
+    'drift_conventional': ('drift, processed conventionally',
+        {'processor': 'conventional', 'frequency_min': 200.0}),
+    'drift_spectra': ('the first four records of a drift, as cross-spectra of 45 MB each',
+        {'level': 'csdm', 'records': 4, 'appearing': (), 'fading': ()}),
     'drift_traces': ('drift, traces straight away', {'level': 'trace'}),
-    'small': (
-        'a short drift of an array of 8 hydrophones in a coarse band, small enough for a bag',
-        {
-            'level': 'csdm',
-            'phones': 8,
-            'element_spacing': 0.36,
-            'records': 12,
-            'snapshots': 512,
-            'snapshot_seconds': 0.2,
-            'frequency_max': 2000.0,
-            'layers': 3,
-            'amplitude': 0.25,
-            'appearing': (),
-            'fading': (4,),
-            'fade_records': 3,
-            'depth_companion': True,
-        },
-    ),
+    'small': ('a short drift of an array of 8 hydrophones in a coarse band, small enough for a '
+        'bag',
+        {'level': 'csdm', 'phones': 8, 'element_spacing': 0.36, 'records': 12, 'snapshots': 512,
+         'snapshot_seconds': 0.2, 'frequency_max': 2000.0, 'layers': 3, 'amplitude': 0.25,
+         'appearing': (), 'fading': (4,), 'fade_records': 3, 'depth_companion': True}),
     'ship_pass': ('drift with a ship that comes by', {'ship_pass': (150, 190)}),
-    'diffuse': (
-        'a profiler over a diffuse floor: envelopes, three layers in volume scatter',
-        {
-            'level': 'envelope',
-            'record_seconds': 1.0,
-            'array_depth': 0.0,
-            'array_depth_std': 0.0,
-            'heave': 0.0,
-            'first_depth': 16.0,
-            'layers': 3,
-            'layer_spacing': 5.0,
-            'tilt_walk': 0.1,
-            'depth_walk': 0.02,
-            'amplitude': 0.3,
-            'amplitude_swing': 0.3,
-            'appearing': (),
-            'fading': (),
-            'scatter': 0.25,
-            'noise_sigma': 0.02,
-            'depth_min': 4.5,
-            'depth_max': 45.0,
-            'depth_step': 0.2,
-        },
-    ),
-    'pressure': (
-        'twelve records of eight seconds of pressure at 16 hydrophones over three layers',
-        {
-            'level': 'pressure',
-            'records': 12,
-            'record_seconds': 8.0,
-            'phones': 16,
-            'element_spacing': 0.25,
-            'sample_rate': 6000.0,
-            'frequency_min': 100.0,
-            'frequency_max': 2800.0,
-            'whitened': True,
-            'steps_per_sigma': 3.0,
-            'ship_noise': 0.5,
-            'phone_noise': 1e-3,
-            'array_depth': 30.0,
-            'heave': 0.5,
-            'heave_records': 12.0,
-            'first_depth': 52.0,
-            'layers': 3,
-            'layer_spacing': 7.0,
-            'depth_walk': 0.05,
-            'tilt_walk': 0.0,
-            'amplitude': 0.3,
-            'depth_min': 42.0,
-            'depth_max': 74.0,
-            'appearing': (),
-            'fading': (),
-        },
-    ),
+    'diffuse': ('a profiler over a diffuse floor: envelopes, three layers in volume scatter',
+        {'level': 'envelope', 'record_seconds': 1.0, 'array_depth': 0.0, 'array_depth_std': 0.0,
+         'heave': 0.0, 'first_depth': 16.0, 'layers': 3, 'layer_spacing': 5.0, 'tilt_walk': 0.1,
+         'depth_walk': 0.02, 'amplitude': 0.3, 'amplitude_swing': 0.3, 'appearing': (),
+         'fading': (), 'scatter': 0.25, 'noise_sigma': 0.02, 'depth_min': 4.5, 'depth_max': 45.0,
+         'depth_step': 0.2}),
+    'pressure': ('twelve records of eight seconds of pressure at 16 hydrophones over three layers',
+        {'level': 'pressure', 'records': 12, 'record_seconds': 8.0, 'phones': 16,
+         'element_spacing': 0.25, 'sample_rate': 6000.0, 'frequency_min': 100.0,
+         'frequency_max': 2800.0, 'whitened': True, 'steps_per_sigma': 3.0, 'ship_noise': 0.5,
+         'phone_noise': 1e-3, 'array_depth': 30.0, 'heave': 0.5, 'heave_records': 12.0,
+         'first_depth': 52.0, 'layers': 3, 'layer_spacing': 7.0, 'depth_walk': 0.05,
+         'tilt_walk': 0.0, 'amplitude': 0.3, 'depth_min': 42.0, 'depth_max': 74.0, 'appearing': (),
+         'fading': ()}),
 }
+# fmt: on
 """Name: (what it is, what differs from the defaults of `FathometerScenario`)."""
 
-
-def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> FathometerScenario:
-    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
-    return FathometerScenario.named(name, SCENARIOS, overrides)
+scenario = FathometerScenario.among(SCENARIOS)
 
 
 @frozen(eq=False)
@@ -287,7 +229,7 @@ class Drift:
     array_depth_stated: FloatArray
 
 
-def drift_of(config: FathometerScenario, rng: np.random.Generator) -> Drift:
+def drift_of(config: FathometerScenario, rng: Generator) -> Drift:
     """Draw the floor and the path of the array."""
     T, K = config.records, config.layers + len(config.appearing)
     together = np.cumsum(config.tilt_walk * rng.standard_normal(T))

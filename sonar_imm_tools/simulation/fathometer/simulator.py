@@ -15,7 +15,12 @@ written of a scene:
     response  traces processed from such cross-spectra;
     trace     traces made directly, of pulses and noise in the same band: hundreds per second;
     envelope  of a sub-bottom profiler over a floor that scatters, see `envelope`;
-    pressure  time series drawn from the cross-spectral model (`field`): for short scenes.
+    pressure  time series drawn from the cross-spectral model: for short scenes.
+
+Pressure is drawn over a whole record: at each frequency of its own transform C n, with R = C C^H
+and n standard complex normal, and all of it transformed back. Every angle, the exact delays
+and what is lost of long lags come by themselves; plane waves summed up at some angles put echoes
+too shallow, make them weaker and leave peaks beside them.
 """
 
 from __future__ import annotations
@@ -24,15 +29,17 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
 
 from sonar_imm.acoustics import fathometer
-from sonar_imm.acoustics.ambient import sample_csdm
+from sonar_imm.acoustics.ambient import horizontal_noise_csdm, sample_csdm, surface_noise_csdm
 from sonar_imm.acoustics.pulse import band_pulse, gaussian_pulse
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import ComplexArray, FloatArray
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from sonar_imm.truth import Received, Scene, TrueReflectors
 
-from .field import expected_csdm, pressure_field
+from ..scenario import FIRST_STAMP_NS
 from .scenario import Drift, drift_of, FathometerScenario, scenario, SCENARIOS
 
 __all__ = [
@@ -45,7 +52,6 @@ __all__ = [
     'stream',
 ]
 
-FIRST_STAMP_NS = 1_700_000_000_000_000_000
 _THRESHOLD = 3.0
 """Standard deviations of the noise below which a profiler writes zero."""
 FRAME_ID = 'array'
@@ -91,9 +97,7 @@ def stamp_of(config: FathometerScenario, record: int) -> int:
     return FIRST_STAMP_NS + round((record + 1) * config.record_seconds * 1e9)
 
 
-def _measurements(
-    config: FathometerScenario, drift: Drift, rng: np.random.Generator
-) -> Iterator[list[Any]]:
+def _measurements(config: FathometerScenario, drift: Drift, rng: Generator) -> Iterator[list[Any]]:
     """The measurements of each record."""
     for record in range(config.records):
         stated = None if config.depth_companion else float(drift.array_depth_stated[record])
@@ -116,11 +120,7 @@ def _measurements(
 
 
 def cross_spectra(
-    config: FathometerScenario,
-    drift: Drift,
-    record: int,
-    stated: float | None,
-    rng: np.random.Generator,
+    config: FathometerScenario, drift: Drift, record: int, stated: float | None, rng: Generator
 ) -> CrossSpectra:
     """A sample of the cross-spectra of one record around their expectation. stated: the depth of
     the array that the record states."""
@@ -145,7 +145,7 @@ def _depths(config: FathometerScenario) -> FloatArray:
 
 
 def _response(
-    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+    config: FathometerScenario, drift: Drift, record: int, rng: Generator
 ) -> tuple[FloatArray, float]:
     """What the processor makes of cross-spectra, and its noise."""
     spectra = cross_spectra(config, drift, record, None, rng)
@@ -164,7 +164,7 @@ def _response(
 
 
 def _pulses(
-    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+    config: FathometerScenario, drift: Drift, record: int, rng: Generator
 ) -> tuple[FloatArray, float]:
     """Pulses, and noise through the same band, with the error of the array's depth."""
     depth, step = _depths(config), config.depth_step
@@ -186,11 +186,7 @@ def _pulses(
 
 
 def pressure_blocks(
-    config: FathometerScenario,
-    drift: Drift,
-    record: int,
-    stated: float | None,
-    rng: np.random.Generator,
+    config: FathometerScenario, drift: Drift, record: int, stated: float | None, rng: Generator
 ) -> list[Pressure]:
     """The pressure of one record in blocks of `block_seconds`, the last ends with the record."""
     pressure = pressure_field(config, drift, record, rng)
@@ -216,7 +212,7 @@ def pressure_blocks(
 
 
 def _envelope(
-    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+    config: FathometerScenario, drift: Drift, record: int, rng: Generator
 ) -> tuple[FloatArray, None]:
     """The stacked envelope (n,) of one record, as a sub-bottom profiler records it over a floor
     that scatters in its volume; it says nothing of its noise.
@@ -255,6 +251,50 @@ _TRACES = {'response': _response, 'trace': _pulses, 'envelope': _envelope}
 """Level: how the amplitudes of its traces are made, and the standard deviation of their noise."""
 
 
-def _complex_noise(count: int, rng: np.random.Generator) -> FloatArray:
+def _complex_noise(count: int, rng: Generator) -> FloatArray:
     """Of unit power, (count,) complex."""
     return rng.standard_normal((count, 2)) @ np.array([1.0, 1j]) * np.sqrt(0.5)
+
+
+_AT_ONCE = 2048
+"""Frequencies whose matrices are in memory together."""
+
+
+def expected_csdm(
+    config: FathometerScenario, drift: Drift, record: int, frequency: FloatArray
+) -> ComplexArray:
+    """R (F, M, M) of a record at `frequency` (F,) Hz."""
+    there = drift.amplitude[record] != 0.0
+    array = config.phones, config.element_spacing
+    R = surface_noise_csdm(
+        frequency,
+        *array,
+        drift.depth[record, there] - drift.array_depth[record],
+        drift.amplitude[record, there],
+        config.sound_speed,
+    )
+    passing = config.ship_pass and config.ship_pass[0] <= record <= config.ship_pass[1]
+    ships = (100.0 if passing else 1.0) * config.ship_noise / (1.0 + (frequency / 200.0) ** 2)
+    R += ships[:, None, None] * horizontal_noise_csdm(frequency, *array, 0.03, config.sound_speed)
+    R += config.phone_noise * np.eye(config.phones)
+    if not config.whitened:
+        # Surface noise is red: it falls by 5 dB per octave.
+        R *= ((frequency / 1000.0) ** -1.6)[:, None, None]
+    return R
+
+
+def pressure_field(
+    config: FathometerScenario, drift: Drift, record: int, rng: Generator
+) -> NDArray[np.float32]:
+    """Pressure (n, M) of one record; a two-sided spectrum of R."""
+    length = round(config.record_seconds * config.sample_rate)
+    frequency = np.asarray(np.fft.rfftfreq(length, 1.0 / config.sample_rate), np.float64)
+    low, high = 0.5 * config.frequency_min, 1.2 * config.frequency_max
+    inside = np.flatnonzero((frequency >= low) & (frequency <= high))
+    spectra = np.zeros((len(frequency), config.phones), np.complex64)
+    for rows in np.split(inside, range(_AT_ONCE, len(inside), _AT_ONCE)):
+        root = np.linalg.cholesky(expected_csdm(config, drift, record, frequency[rows]))
+        noise = rng.standard_normal((len(rows), config.phones, 2)) @ np.array([1.0, 1j])
+        spectra[rows] = np.sqrt(0.5) * (root @ noise[..., None])[..., 0]
+    pressure = np.fft.irfft(spectra, length, axis=0) * np.sqrt(length)
+    return pressure.astype(np.float32)

@@ -23,15 +23,17 @@ through the vertical pattern of the sonar, out and back.
 from __future__ import annotations
 
 import numpy as np
+from numpy.random import Generator
 from scipy.ndimage import convolve1d
 from scipy.signal.windows import taylor
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.estimation.arrays import ComplexArray, FloatArray
-from sonar_imm.measurements import nanoseconds, SonarImage
+from sonar_imm.measurements import SonarImage
 from sonar_imm.truth import Received
 
+from ..scenario import delay_ns
 from .scenario import ObstacleScenario
 
 _TEXTURE = 256
@@ -50,7 +52,7 @@ class ImageSonar:
     rad from north of the line of a chain or a wreck.
     """
 
-    def __init__(self, config: ObstacleScenario, rng: np.random.Generator):
+    def __init__(self, config: ObstacleScenario, rng: Generator):
         self.config = config
         self._rng = rng
         step = config.max_range / config.image_bins
@@ -190,7 +192,7 @@ def image_pings(
     for k, stamp in enumerate(stamps):
         pose = Pose(poses.position[k], poses.R[k])
         pixels = sonar.image(pose, [place[k] for place in places], stretch)
-        late = config.late_delay * rng.uniform() if rng.uniform() < config.late_fraction else 0.0
+        late = delay_ns(config, rng)
         if rng.uniform() < config.ping_loss:
             continue
         image = SonarImage(
@@ -200,7 +202,7 @@ def image_pings(
             amplitude=pixels.astype(np.float64),
             frame_id='sonar',
         )
-        received.append(Received(int(stamp) + nanoseconds(late), image))
+        received.append(Received(int(stamp) + late, image))
     return received
 
 

@@ -17,7 +17,7 @@ from attrs import frozen
 from sonar_imm.acoustics.geometry import AZIMUTH_MODELS
 from sonar_imm.parameters import parameter
 
-from ..scenario import Scenario
+from ..scenario import Scenario, Scenarios
 
 TARGETS = ('point', 'chain', 'float', 'wreck')
 FADINGS = ('steady', 'rayleigh')
@@ -250,139 +250,66 @@ class ObstacleScenario(ImageScenario):
 
 _LEVEL = {'roll_rms_deg': 0.0, 'pitch_rms_deg': 0.0, 'heave_rms': 0.0}
 _STRESS = {
-    'detection_probability': 0.7,
-    'outlier_probability': 0.1,
-    'ping_jitter': 0.3,
-    'ping_loss': 0.05,
-    'navigation_gaps': 2.0,
-}
+    'detection_probability': 0.7, 'outlier_probability': 0.1, 'ping_jitter': 0.3,
+    'ping_loss': 0.05, 'navigation_gaps': 2.0,
+}  # fmt: skip
 _FIELD = {
-    'detection_probability': 0.9,
-    'clutter': 5.0,
-    'random_course': True,
-    'passing_distance': 12.0,
-}
+    'detection_probability': 0.9, 'clutter': 5.0, 'random_course': True, 'passing_distance': 12.0,
+}  # fmt: skip
 _IMAGES = {
-    'images': True,
-    'image_beams': 128,
-    'image_bins': 330,
-    'max_range': 55.0,
-    'first_range': 52.0,
-    'last_range': 12.0,
-    'altitude': 6.0,
-    'roll_rms_deg': 3.0,
-    'target_snr_db': 26.0,
-}
+    'images': True, 'image_beams': 128, 'image_bins': 330, 'max_range': 55.0, 'first_range': 52.0,
+    'last_range': 12.0, 'altitude': 6.0, 'roll_rms_deg': 3.0, 'target_snr_db': 26.0,
+}  # fmt: skip
 _ROUGH = {'seabed_shape': 1.5}
 
-SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
+# fmt: off
+SCENARIOS: Scenarios = {
     'approach': ('an obstacle 3 m below the sonar', {}),
-    'elevation': (
-        'the same, and the sonar measures elevations to 1 degree',
-        {'elevation_std_deg': 1.0},
-    ),
+    'elevation': ('the same, and the sonar measures elevations to 1 degree',
+        {'elevation_std_deg': 1.0}),
     'nearly_level': ('an obstacle 0.5 m below the sonar', {'vertical_offset': 0.5}),
     'above': ('an obstacle 6 m above the sonar', {'vertical_offset': -6.0}),
-    'float': (
-        'a float at the surface, 6 m above the sonar',
-        {'vertical_offset': -6.0, 'depth': 6.0, 'altitude': 29.0},
-    ),
+    'float': ('a float at the surface, 6 m above the sonar',
+        {'vertical_offset': -6.0, 'depth': 6.0, 'altitude': 29.0}),
     'rolling': ('3 m below, and the vehicle rolls 4 degrees rms', {'roll_rms_deg': 4.0}),
-    'calm': (
-        'anywhere within 10 m above or below, and the vehicle moves a fifth as much as usual',
-        {
-            'vertical_offset': 0.0,
-            'offset_spread': 10.0,
-            'roll_rms_deg': 0.3,
-            'pitch_rms_deg': 0.2,
-            'yaw_rms_deg': 0.3,
-            'heave_rms': 0.042,
-            'sway_rms': 0.028,
-        },
-    ),
-    'mirror': (
-        'a level path with perfect navigation: above and below look the same',
-        {
-            **_LEVEL,
-            'vertical_offset': 4.0,
-            'ideal_navigation': True,
-            'sound_speed_error': 0.0,
-        },
-    ),
+    'calm': ('anywhere within 10 m above or below, and the vehicle moves a fifth as much as usual',
+        {'vertical_offset': 0.0, 'offset_spread': 10.0, 'roll_rms_deg': 0.3, 'pitch_rms_deg': 0.2,
+         'yaw_rms_deg': 0.3, 'heave_rms': 0.042, 'sway_rms': 0.028}),
+    'mirror': ('a level path with perfect navigation: above and below look the same',
+        {**_LEVEL, 'vertical_offset': 4.0, 'ideal_navigation': True, 'sound_speed_error': 0.0}),
     'diving': ('3 m below at first, while the vehicle goes up and down 2 m', {'dive': 2.0}),
     'rough_seabed': ('3 m below, over a sea floor with 0.5 m of relief', {'seabed_relief': 0.5}),
     'stress': ('3 m below: misses, outliers, jitter, lost pings, navigation gaps', _STRESS),
-    'tethers': (
-        'two moored spheres on tethers of 15 and 12 m, the vehicle 15.5 m above the sea floor',
-        {
-            'placement': 'tether',
-            'altitude': 15.5,
-            'obstacles': 2,
-            'spacing': 12.0,
-            'detection_probability': 0.9,
-            'clutter': 1.0,
-        },
-    ),
-    'seabed': (
-        'objects on the sea floor, 6 m below',
-        {'placement': 'seabed', 'altitude': 6.0, 'obstacles': 3, **_FIELD},
-    ),
-    'surface': (
-        'floats at the surface, 6 m above',
-        {'placement': 'surface', 'depth': 6.0, 'obstacles': 3, **_FIELD},
-    ),
-    'six': (
-        'six obstacles at different depths, in clutter',
-        {
-            'obstacles': 6,
-            'vertical_offset': 0.0,
-            'offset_spread': 5.0,
-            'first_range': 55.0,
-            'last_range': 0.0,
-            **_FIELD,
-        },
-    ),
-    'swaying': (
-        'an obstacle 3 m below that sways half a metre about its mooring',
-        {'obstacle_motion': 'swaying'},
-    ),
+    'tethers': ('two moored spheres on tethers of 15 and 12 m, the vehicle 15.5 m above the sea '
+        'floor',
+        {'placement': 'tether', 'altitude': 15.5, 'obstacles': 2, 'spacing': 12.0,
+         'detection_probability': 0.9, 'clutter': 1.0}),
+    'seabed': ('objects on the sea floor, 6 m below',
+        {'placement': 'seabed', 'altitude': 6.0, 'obstacles': 3, **_FIELD}),
+    'surface': ('floats at the surface, 6 m above',
+        {'placement': 'surface', 'depth': 6.0, 'obstacles': 3, **_FIELD}),
+    'six': ('six obstacles at different depths, in clutter',
+        {'obstacles': 6, 'vertical_offset': 0.0, 'offset_spread': 5.0, 'first_range': 55.0,
+         'last_range': 0.0, **_FIELD}),
+    'swaying': ('an obstacle 3 m below that sways half a metre about its mooring',
+        {'obstacle_motion': 'swaying'}),
     'mover': ('an obstacle 3 m below that moves', {'obstacle_motion': 'moving'}),
-    'movers': (
-        'three obstacles that move, at different depths, in clutter',
-        {
-            'obstacle_motion': 'moving',
-            'obstacles': 3,
-            'spacing': 12.0,
-            'vertical_offset': 0.0,
-            'offset_spread': 5.0,
-            'first_range': 70.0,
-            'detection_probability': 0.9,
-            'clutter': 2.0,
-            'passing_distance': 12.0,
-        },
-    ),
-    'images': (
-        'an obstacle 3 m below in images of a small sonar, over a sea floor',
-        {**_IMAGES, 'target': 'float', 'target_size': 0.5},
-    ),
-    'rough_chain': (
-        'a chain of 6 m in images over a rough sea floor',
-        {**_IMAGES, **_ROUGH, 'target': 'chain', 'target_size': 6.0},
-    ),
-    'rough_wreck': (
-        'the outline of a wreck of 12 m in images of a rough sea floor, on which it lies',
-        {
-            **_IMAGES,
-            **_ROUGH,
-            'target': 'wreck',
-            'target_size': 12.0,
-            'placement': 'seabed',
-            'altitude': 2.5,
-        },
-    ),
-    'late': (
-        'pings and navigation received late and out of order',
-        {'late_fraction': 0.3, 'navigation_latency': 0.4, 'ping_jitter': 0.3},
-    ),
+    'movers': ('three obstacles that move, at different depths, in clutter',
+        {'obstacle_motion': 'moving', 'obstacles': 3, 'spacing': 12.0, 'vertical_offset': 0.0,
+         'offset_spread': 5.0, 'first_range': 70.0, 'detection_probability': 0.9, 'clutter': 2.0,
+         'passing_distance': 12.0}),
+    'images': ('an obstacle 3 m below in images of a small sonar, over a sea floor',
+        {**_IMAGES, 'target': 'float', 'target_size': 0.5}),
+    'rough_chain': ('a chain of 6 m in images over a rough sea floor',
+        {**_IMAGES, **_ROUGH, 'target': 'chain', 'target_size': 6.0}),
+    'rough_wreck': ('the outline of a wreck of 12 m in images of a rough sea floor, on which it '
+        'lies',
+        {**_IMAGES, **_ROUGH, 'target': 'wreck', 'target_size': 12.0, 'placement': 'seabed',
+         'altitude': 2.5}),
+    'late': ('pings and navigation received late and out of order',
+        {'late_fraction': 0.3, 'navigation_latency': 0.4, 'ping_jitter': 0.3}),
 }
+# fmt: on
 """Name: (what it is, what differs from the defaults of `ObstacleScenario`)."""
+
+scenario = ObstacleScenario.among(SCENARIOS)

@@ -19,11 +19,11 @@ Measurements are in ROS axes, ENU and FLU; inside, all is NED and FRD as in the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 from attrs import frozen
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from sonar_imm.acoustics import geometry
@@ -32,8 +32,9 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Altitude, Detections, nanoseconds, Navigation
 from sonar_imm.truth import Received, Scene, TruthTable
 
+from ..scenario import delay_ns, FIRST_STAMP_NS, lasting, stamps_of
 from .images import image_pings
-from .scenario import ObstacleScenario, SCENARIOS
+from .scenario import ObstacleScenario, scenario, SCENARIOS
 
 # -- where obstacles are at any time: they stay, sway about their place, or move ------------------
 
@@ -48,7 +49,7 @@ _AHEAD = np.radians(12.0)
 class Swing:
     """A random narrow-band oscillation: `value` at any time (n,)."""
 
-    def __init__(self, rms: float, period: float, rng: np.random.Generator):
+    def __init__(self, rms: float, period: float, rng: Generator):
         self.rate = 2.0 * np.pi / (period * rng.uniform(0.75, 1.3, WAVES))
         self.phase = rng.uniform(0.0, 2.0 * np.pi, WAVES)
         share = rng.uniform(0.6, 1.0, WAVES)
@@ -107,9 +108,7 @@ def paths(
     return [_path(config, place, course, rng) for place in places]
 
 
-def _path(
-    config: ObstacleScenario, place: FloatArray, course: float, rng: np.random.Generator
-) -> Path:
+def _path(config: ObstacleScenario, place: FloatArray, course: float, rng: Generator) -> Path:
     if config.obstacle_motion == 'swaying':
         return Path(place, sway=_sway(config, rng))
     if config.obstacle_motion == 'swinging':
@@ -128,19 +127,14 @@ def _path(
     return Path(place)
 
 
-def _sway(config: ObstacleScenario, rng: np.random.Generator) -> FloatArray:
+def _sway(config: ObstacleScenario, rng: Generator) -> FloatArray:
     """An Ornstein-Uhlenbeck process (n, 2) of the given deviation and memory."""
     duration = (config.first_range - config.last_range) / config.speed + 2.0
-    keep = np.exp(-_SWAY_STEP / config.obstacle_sway_time)
-    n = int(duration / _SWAY_STEP) + 2
-    u = np.empty((n, 2))
-    u[0] = rng.normal(size=2)
-    for k in range(1, n):
-        u[k] = keep * u[k - 1] + np.sqrt(1.0 - keep**2) * rng.normal(size=2)
-    return config.obstacle_sway * u
+    white = rng.normal(size=(int(duration / _SWAY_STEP) + 2, 2))
+    return config.obstacle_sway * lasting(white, np.exp(-_SWAY_STEP / config.obstacle_sway_time))
 
 
-def _speed(config: ObstacleScenario, course: float, rng: np.random.Generator) -> FloatArray:
+def _speed(config: ObstacleScenario, course: float, rng: Generator) -> FloatArray:
     """North and east velocity: any heading that keeps the obstacle before the sonar."""
     low, high = config.obstacle_speed
     size = rng.uniform(low, high)
@@ -158,7 +152,6 @@ def _speed(config: ObstacleScenario, course: float, rng: np.random.Generator) ->
 
 __all__ = ['ObstacleScenario', 'SCENARIOS', 'TrueObstacle', 'scenario', 'simulate']
 
-FIRST_STAMP_NS = 1_700_000_000_000_000_000
 DOES = ('fixed', 'swaying', 'moving', 'seabed')
 LEAD_IN = 1.0
 """Seconds of navigation before the first ping and after the last."""
@@ -204,16 +197,11 @@ class TrueObstacle:
             yield TruthTable(int(stamp), frame_id, row)
 
 
-def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> ObstacleScenario:
-    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
-    return ObstacleScenario.named(name, SCENARIOS, overrides)
-
-
 def simulate(config: ObstacleScenario, seed: int) -> Scene:
     """Run a scene. The same config and seed give the same scene; `truth` holds `TrueObstacle`."""
     rng = np.random.default_rng(seed)
     vehicle = _Vehicle(config, rng)
-    stamps = FIRST_STAMP_NS + np.round(_ping_times(config, rng) * 1e9).astype(np.int64)
+    stamps = stamps_of(_ping_times(config, rng))
     times: FloatArray = (stamps - FIRST_STAMP_NS).astype(np.float64) * 1e-9
     obstacles = paths(config, _place(config, vehicle, rng), vehicle.course, seed)
     stretch = 1.0 + config.sound_speed_error * rng.normal()
@@ -238,7 +226,7 @@ def simulate(config: ObstacleScenario, seed: int) -> Scene:
 class _Vehicle:
     """Pose of the vehicle at any time, NED and FRD."""
 
-    def __init__(self, config: ObstacleScenario, rng: np.random.Generator):
+    def __init__(self, config: ObstacleScenario, rng: Generator):
         self.config = config
         self.course = (
             rng.uniform(-np.pi, np.pi) if config.random_course else np.radians(config.course_deg)
@@ -277,7 +265,7 @@ class _Vehicle:
         return geometry.mounted(self.pose(t), self.lever, self.mount)
 
 
-def _ping_times(config: ObstacleScenario, rng: np.random.Generator) -> FloatArray:
+def _ping_times(config: ObstacleScenario, rng: Generator) -> FloatArray:
     """Times of the pings, s, until the vehicle is `last_range` from the first obstacle."""
     step = 1.0 / config.ping_rate
     times = np.arange(0.0, (config.first_range - config.last_range) / config.speed, step)
@@ -293,9 +281,7 @@ def _seabed(config: ObstacleScenario, along: FloatArray) -> FloatArray:
 # -- obstacles ---------------------------------------------------------------------------------
 
 
-def _place(
-    config: ObstacleScenario, vehicle: _Vehicle, rng: np.random.Generator
-) -> list[FloatArray]:
+def _place(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> list[FloatArray]:
     """Positions of the obstacles, NED. The first one is `first_range` from the first ping, each
     further one `spacing` behind. The passing distance of each is drawn at random."""
     sonar = vehicle.sonar(np.zeros(()))
@@ -311,9 +297,7 @@ def _place(
     return places
 
 
-def _offset(
-    config: ObstacleScenario, number: int, depth: float, rng: np.random.Generator
-) -> float:
+def _offset(config: ObstacleScenario, number: int, depth: float, rng: Generator) -> float:
     """Vertical offset of one obstacle from the sonar at the first ping, m, below positive."""
     seabed = config.depth + config.altitude
     if config.placement == 'offset':
@@ -326,9 +310,7 @@ def _offset(
 # -- measurements ------------------------------------------------------------------------------
 
 
-def _navigate(
-    config: ObstacleScenario, vehicle: _Vehicle, rng: np.random.Generator
-) -> list[Received]:
+def _navigate(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> list[Received]:
     """Odometry by dead reckoning, and the altimeter."""
     last = (config.first_range - config.last_range) / config.speed + LEAD_IN
     t = np.arange(-LEAD_IN, last, 1.0 / config.navigation_rate)
@@ -352,9 +334,11 @@ def _navigate(
         steps = 0.5 * (over_ground[1:] + over_ground[:-1]) * np.diff(t)[:, None]
         position = position[0] + np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
         position[:, 2] = vehicle.position(t)[:, 2] + config.depth_std * rng.normal(size=len(t))
-    turn = _turn_rate(vehicle, t)
+    before, after = vehicle.pose(t - _FINE).R, vehicle.pose(t + _FINE).R
+    turned = Rotation.from_matrix(np.swapaxes(before, -1, -2) @ after)
+    turn = turned.as_rotvec() / (2.0 * _FINE)
     q = Rotation.from_matrix(geometry.flip_rotation(R)).as_quat()
-    stamps = _stamps(t + config.navigation_delay)
+    stamps = stamps_of(t + config.navigation_delay)
     gaps = _gaps(config, t, rng)
     received = [
         Received(
@@ -372,13 +356,11 @@ def _navigate(
         for k in np.flatnonzero(~gaps)
     ]
     every = max(1, round(config.navigation_rate / 2.0))
-    along = config.speed * t
-    heights = _seabed(config, along) - vehicle.position(t)[:, 2]
+    heights = _seabed(config, config.speed * t) - vehicle.position(t)[:, 2]
     heights = heights + config.altitude_std * rng.normal(size=len(t))
     received += [
         Received(
-            int(stamps[k]),
-            Altitude(stamp_ns=int(stamps[k]), altitude=max(float(heights[k]), 0.0)),
+            int(stamps[k]), Altitude(stamp_ns=int(stamps[k]), altitude=max(float(heights[k]), 0.0))
         )
         for k in range(0, len(t), every)
         if config.altimeter
@@ -386,14 +368,7 @@ def _navigate(
     return received
 
 
-def _turn_rate(vehicle: _Vehicle, t: FloatArray) -> FloatArray:
-    """Turn rate (n, 3) of the body, rad/s."""
-    before, after = vehicle.pose(t - _FINE).R, vehicle.pose(t + _FINE).R
-    turned = Rotation.from_matrix(np.swapaxes(before, -1, -2) @ after)
-    return turned.as_rotvec() / (2.0 * _FINE)
-
-
-def _gaps(config: ObstacleScenario, t: FloatArray, rng: np.random.Generator) -> np.ndarray:
+def _gaps(config: ObstacleScenario, t: FloatArray, rng: Generator) -> np.ndarray:
     """True (n,) in the gaps of the navigation, of `navigation_gap` seconds each."""
     silent = np.zeros(len(t), bool)
     if config.navigation_gaps > 0.0:
@@ -403,11 +378,7 @@ def _gaps(config: ObstacleScenario, t: FloatArray, rng: np.random.Generator) -> 
 
 
 def _echoes(
-    config: ObstacleScenario,
-    vehicle: _Vehicle,
-    times: FloatArray,
-    path: Path,
-    stretch: float,
+    config: ObstacleScenario, vehicle: _Vehicle, times: FloatArray, path: Path, stretch: float
 ) -> tuple[FloatArray, np.ndarray]:
     """Range, azimuth and elevation, positive down, (n, 3) of an obstacle at each ping without
     noise, and whether it is inside the beam (n,)."""
@@ -433,7 +404,7 @@ def _pings(
     config: ObstacleScenario,
     stamps: np.ndarray,
     echoes: list[tuple[FloatArray, np.ndarray]],
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> list[Received]:
     """The detections of each ping: echoes that are seen, some of them outliers, and clutter."""
     half = np.radians(0.5 * config.horizontal_fov_deg)
@@ -474,8 +445,7 @@ def _pings(
             elevation=elevation,
             frame_id='sonar',
         )
-        late = config.late_delay * rng.uniform() if rng.uniform() < config.late_fraction else 0.0
-        received.append(Received(int(stamp) + nanoseconds(late), detections))
+        received.append(Received(int(stamp) + delay_ns(config, rng), detections))
     return received
 
 
@@ -507,7 +477,3 @@ def _does(config: ObstacleScenario, path: Path, times: FloatArray) -> np.ndarray
     if path.sway is not None or path.swing is not None:
         still = 'swaying'
     return np.where(path.moves(times), DOES.index('moving'), DOES.index(still))
-
-
-def _stamps(t: FloatArray) -> np.ndarray:
-    return FIRST_STAMP_NS + np.round(t * 1e9).astype(np.int64)

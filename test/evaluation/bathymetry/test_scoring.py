@@ -34,15 +34,16 @@ from sonar_imm_tools.evaluation.bathymetry.figures import (
     verdict_figure,
 )
 from sonar_imm_tools.evaluation.bathymetry.predictive import for_tuning, Scored, tunables
-from sonar_imm_tools.evaluation.bathymetry.profiles import (
+from sonar_imm_tools.evaluation.bathymetry.scoring import (
     Profile,
     profile_of,
     profiles_of,
     rough_models,
+    runs,
+    score,
     Swath,
     TrueFloor,
 )
-from sonar_imm_tools.evaluation.bathymetry.scoring import runs, score
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
 from sonar_imm_tools.evaluation.numbers import cards, lines
 from sonar_imm_tools.offline.run_folder import RunFolder

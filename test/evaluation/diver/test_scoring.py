@@ -29,9 +29,15 @@ from scipy.stats import chi2, norm
 
 from sonar_imm.measurements import Fix
 from sonar_imm_tools.evaluation.diver import figures, METRICS, summary_sentence
-from sonar_imm_tools.evaluation.diver.matching import assign, match, track_summary
 from sonar_imm_tools.evaluation.diver.scoring import fix_series, score
-from sonar_imm_tools.evaluation.diver.series import series_of, Truth, TruthPath
+from sonar_imm_tools.evaluation.diver.series import (
+    assign,
+    match,
+    series_of,
+    track_summary,
+    Truth,
+    TruthPath,
+)
 from sonar_imm_tools.evaluation.numbers import lines
 from sonar_imm_tools.evaluation.plotting import view_of
 from sonar_imm_tools.offline.run_folder import finite

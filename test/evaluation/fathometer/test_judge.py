@@ -30,8 +30,13 @@ from sonar_imm_tools.evaluation.fathometer.crossing import (
     summary,
 )
 from sonar_imm_tools.evaluation.fathometer.predictive import for_tuning, Scored, tunables
-from sonar_imm_tools.evaluation.fathometer.records import Record, records_of, Reflections
-from sonar_imm_tools.evaluation.fathometer.scoring import pair, score
+from sonar_imm_tools.evaluation.fathometer.scoring import (
+    pair,
+    Record,
+    records_of,
+    Reflections,
+    score,
+)
 from sonar_imm_tools.evaluation.judging import judge
 from sonar_imm_tools.offline.run_folder import read_measurements, RunFolder
 from sonar_imm_tools.recordings.conversion import ConversionReport, write_bag

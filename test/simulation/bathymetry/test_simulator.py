@@ -19,8 +19,7 @@ from sonar_imm.measurements import Navigation, Snapshot
 from sonar_imm.parameters import ConfigError
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-from sonar_imm_tools.evaluation.bathymetry.profiles import profiles_of
-from sonar_imm_tools.evaluation.bathymetry.scoring import score
+from sonar_imm_tools.evaluation.bathymetry.scoring import profiles_of, score
 from sonar_imm_tools.simulation.bathymetry.objects import (
     above,
     FACE,

@@ -17,8 +17,7 @@ from sonar_imm.measurements import Fix
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.georeferencing import Georeferencer
-from sonar_imm_tools.simulation.diver.afloat import ORIGIN
-from sonar_imm_tools.simulation.diver.crossing import CLOSEST, crossing_paths
+from sonar_imm_tools.simulation.diver.fixes import CLOSEST, crossing_paths, ORIGIN
 from sonar_imm_tools.simulation.diver.simulator import (
     draw_errors,
     RECEIVERS,

@@ -273,7 +273,7 @@ def test_depth_in_the_profile_is_counted_from_the_surface():
 
 SECOND = 10**9
 START = 10**6
-CONFIG = BathymetryConfig(sound_speed=1500.0, max_gap=2.0, max_extrapolation=0.0)
+CONFIG = BathymetryConfig(sound_speed=1500.0, max_gap=2.0)
 
 
 def ping(seconds, **changes):

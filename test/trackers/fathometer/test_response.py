@@ -32,9 +32,13 @@ from sonar_imm.trackers.fathometer.response import (
     processor_pulse,
     pulse_of,
 )
-from sonar_imm_tools.simulation.fathometer.field import expected_csdm
 from sonar_imm_tools.simulation.fathometer.scenario import Drift
-from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, scenario, simulate
+from sonar_imm_tools.simulation.fathometer.simulator import (
+    cross_spectra,
+    expected_csdm,
+    scenario,
+    simulate,
+)
 
 MIRROR = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
 

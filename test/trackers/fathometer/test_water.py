@@ -19,7 +19,7 @@ from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.reflectors import Identities
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm.trackers.fathometer.water import SeenFloor, Water
-from sonar_imm_tools.evaluation.fathometer.records import records_of
+from sonar_imm_tools.evaluation.fathometer.scoring import records_of
 from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 

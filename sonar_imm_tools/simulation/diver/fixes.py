@@ -6,12 +6,14 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Divers located from a vessel, or in latitude and longitude.
+"""Divers as fixes: in scans with clutter, from a vessel, or in latitude and longitude.
 
-The sensor `usbl` is a transceiver under a vessel that circles the scene: range and direction of
-each diver in the axes of the transceiver, with the diver's number, and the vessel's pose between
-two scans, with white errors that it states. The sensor `geodetic` gives positions in latitude and
-longitude around `ORIGIN`.
+In the motion `crossing` each pair meets near the middle of the scene: straight paths at an angle
+of 20 to 90 degrees, .5 to .9 m/s, that pass each other within a metre about half way through. The
+sensor `scans` gives one `Fixes` for each scan, also an empty one. `usbl` is a transceiver under a
+vessel that circles the scene: range and direction of each diver in the axes of the transceiver,
+with the diver's number, and the vessel's pose between two scans, with white errors that it states.
+`geodetic` gives positions in latitude and longitude around `ORIGIN`.
 """
 
 from __future__ import annotations
@@ -19,31 +21,74 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import GeodeticFix, RelativeFix, VesselPose
+from sonar_imm.measurements import Fixes, GeodeticFix, RelativeFix, VesselPose
+
+ANGLE = np.deg2rad([20.0, 90.0])
+CROSSING_SPEED = (0.5, 0.9)
+CLOSEST = 1.0
+MEETING = (0.46, 0.58)
+"""When a pair is closest, in lengths of the scene."""
+MIDDLE = 20.0
+"""Metres from the origin, on each axis, within which pairs meet."""
+
+
+def crossing_paths(divers: int, times: FloatArray, rng: Generator) -> list[FloatArray]:
+    """States (n, 4), px py vx vy, of `divers` at `times`; with an odd number the last one swims
+    as if it had met a partner."""
+    paths: list[FloatArray] = []
+    for _ in range((divers + 1) // 2):
+        meeting = rng.uniform(*MEETING) * times[-1]
+        place = rng.uniform(-MIDDLE, MIDDLE, 2)
+        heading = rng.uniform(0.0, 2.0 * np.pi)
+        between = rng.uniform(*ANGLE) * rng.choice([-1.0, 1.0])
+        side = rng.uniform(0.0, 2.0 * np.pi)
+        apart = rng.uniform(0.0, CLOSEST) * np.array([np.cos(side), np.sin(side)])
+        for angle, start in ((heading, place), (heading + between, place + apart)):
+            velocity = rng.uniform(*CROSSING_SPEED) * np.array([np.cos(angle), np.sin(angle)])
+            position = start + (times - meeting)[:, None] * velocity
+            paths.append(np.hstack([position, np.tile(velocity, (len(times), 1))]))
+    return paths[:divers]
+
+
+def sense_scan(config: Any, stamp_ns: int, present: FloatArray, rng: Generator) -> list[Fixes]:
+    """All fixes of one scan in no particular order: of divers at `present` (n, 3), and false ones
+    in the square; config: a `DiverScenario`."""
+    half, std = config.clutter_range, config.fix_std
+    seen = present[:, :2][rng.uniform(size=len(present)) < config.detection_probability]
+    false = rng.uniform(-half, half, (rng.poisson(config.clutter), 2))
+    points = rng.permutation(np.vstack([seen + std * rng.normal(size=seen.shape), false]))
+    return [
+        Fixes(
+            stamp_ns=stamp_ns,
+            position=np.column_stack([points, np.zeros(len(points))]),
+            covariance=np.tile(std**2 * np.eye(2), (len(points), 1, 1)),
+            frame_id='map',
+        )
+    ]
+
+
+def instruments_of_scans(config: Any) -> dict[str, float]:
+    """What a user knows of such a sensor, by the names of the tracker's parameters."""
+    return {
+        'clutter_density': max(config.clutter, 1e-3) / (2.0 * config.clutter_range) ** 2,
+        'detection_probability': min(max(config.detection_probability, 0.01), 0.999),
+    }
+
 
 ORIGIN = Origin(59.0, 10.0)
 LEVER = np.array([2.0, -1.0, -3.0])
 """From the reference of the vessel's navigation to the transceiver, metres."""
-RADIUS, SPEED = 50.0, 1.0
+RADIUS, VESSEL_SPEED = 50.0, 1.0
 """Of the vessel's circle, m, and along it, m/s."""
 _HALF_NS = 500_000_000_000
 BEFORE_NS = 300_000_000
 """The pose is that much older than the scan."""
 POSITION_STD, HEADING_STD_DEG, ATTITUDE_STD_DEG = 0.3, 1.0, 0.3
-
-USBL = (
-    'divers with transponders, located from a vessel that circles them',
-    {'sensor': 'usbl', 'divers': 2, 'speed': 0.75, 'start': (0.0, 0.0), 'depth': (5.0, 15.0)},
-)
-GEODETIC = (
-    'fixes in latitude and longitude',
-    {'sensor': 'geodetic', 'speed': 0.75, 'random_rotation': True},
-)
-"""Scenes of `scenarios.SCENARIOS`."""
 
 
 def instruments_of_places(config: Any) -> dict[str, Any]:
@@ -67,7 +112,7 @@ def namespace_of(measurement: Any) -> str:
 def vessel_at(stamp_ns: int) -> tuple[FloatArray, FloatArray]:
     """Position (3,) and roll, pitch, yaw (3,) of the vessel, in a light swell."""
     seconds = (stamp_ns + _HALF_NS) % (2 * _HALF_NS) * 1e-9 - _HALF_NS * 1e-9
-    angle = SPEED * seconds / RADIUS
+    angle = VESSEL_SPEED * seconds / RADIUS
     place = RADIUS * np.array([np.cos(angle), np.sin(angle), 0.0])
     return place, np.array(
         [0.05 * np.sin(seconds), 0.03 * np.sin(0.7 * seconds), angle + 0.5 * np.pi]
@@ -75,7 +120,7 @@ def vessel_at(stamp_ns: int) -> tuple[FloatArray, FloatArray]:
 
 
 def sense_from_vessel(
-    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: np.random.Generator
+    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: Generator
 ) -> list[VesselPose | RelativeFix]:
     """The pose of the vessel a moment before the scan, and each diver that is heard."""
     pose_ns = stamp_ns - BEFORE_NS
@@ -108,7 +153,7 @@ def sense_from_vessel(
 
 
 def sense_geodetic(
-    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: np.random.Generator
+    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: Generator
 ) -> list[GeodeticFix]:
     """Positions with a white error, in latitude and longitude."""
     fixes = []
