@@ -55,6 +55,8 @@ def test_a_stamp_that_is_no_time_of_ros_is_refused_by_name():
         with pytest.raises(Rejection, match=f'the header stamp is {stamp_ns} ns') as caught:
             check_stamp(stamp_ns)
         assert caught.value.reason == 'bad_stamp'
+        with pytest.raises(Rejection, match='the header stamp is'):
+            measurements.Altitude(stamp_ns=stamp_ns, altitude=1.0)
     check_stamp(2**31 * 10**9 - 1)
     check_stamp(1)
 
