@@ -96,6 +96,7 @@ SOAK: dict[str, Callable[[Row], str]] = {
     'hours': _plain('hours', 'g'),
     'memory, MB': _plain('memory_mb', '.0f'),
     'slope, MB/h': _plain('slope_mb_per_h', '.3f'),
+    'grown in the second half, MB': _plain('grown_mb', '.2f'),
     'p99 first tenth, ms': _plain('p99_first_ms', '.2f'),
     'p99 last tenth, ms': _plain('p99_last_ms', '.2f'),
 }
