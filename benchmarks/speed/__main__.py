@@ -15,11 +15,6 @@ record by kernels for other processors; and of the first start.
 
 from __future__ import annotations
 
-if __name__ == '__main__':
-    from sonar_imm.threads import one_blas_thread
-
-    one_blas_thread()  # before numpy is imported, as nodes and commands do
-
 from collections.abc import Sequence
 import hashlib
 import json
