@@ -392,7 +392,8 @@ def main() -> None:
     parts = parts_of(folder)
     if set(PARTS) <= parts.keys():
         whole = all(of['share'] >= 1.0 for of in parts.get('run', {}).values())
-        write_json(RESULT if whole else folder / RESULT.name, parts)
+        result = RESULT if whole else folder / RESULT.name
+        write_json(result, parts, command='make reliability')
         written = PAGE if whole else folder / PAGE.name
         written.write_text(page_of(page, parts), encoding='utf-8')
     problems = short_of(parts)

@@ -179,15 +179,19 @@ def markdown(table: Mapping[str, Row], digits: int = 3) -> str:
 
 
 def write_json(
-    path: Path | None, content: Mapping[str, Any], before: Mapping[str, str] | None = None
+    path: Path | None,
+    content: Mapping[str, Any],
+    before: Mapping[str, str] | None = None,
+    command: str = '',
 ) -> None:
     """Write `content` with how it was made, and the folders to it; nothing without a path.
 
-    before: how the file that this adds to was made.
+    before: how the file that this adds to was made; command: in place of that of this process.
     """
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
-        how = added(before, made()) if before else made()
+        now = made() | ({'command': command} if command else {})
+        how = added(before, now) if before else now
         text = json.dumps({'made': how, **content}, indent=1)
         path.write_text(text + '\n', encoding='utf-8')
 

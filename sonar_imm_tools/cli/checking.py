@@ -208,7 +208,8 @@ def _equal(folder: Path) -> Check:
     )
     result = 'equal bytes'
     if not same:
-        rows = ((path / CSV).read_text(encoding='utf-8').split('\n') for path in (first, second))
+        texts = ((path / CSV).read_text(encoding='utf-8') for path in (first, second))
+        rows = (text.splitlines() for text in texts)
         result = f'{sum(a != b for a, b in zip_longest(*rows))} rows differ'
     return Check('estimates of the node against offline', result, 'equal bytes', same)
 

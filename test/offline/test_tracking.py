@@ -174,7 +174,7 @@ def errors_of(folder, **options):
             for estimate in offline.estimates():
                 estimates.append(estimate)
                 if len(estimates) == 40:
-                    early = offline.warnings()
+                    early = offline.tracker.warnings()
         for k, estimate in enumerate(estimates):
             rows = np.flatnonzero(estimate.extras['track_state'] > 0)
             if k >= 10 and len(rows):
@@ -184,7 +184,7 @@ def errors_of(folder, **options):
                 inside.append(miss @ np.linalg.solve(covariance, miss) <= 5.991)
             number += k >= 10
     assert len(error) > 0.98 * number
-    return np.sqrt(np.mean(np.square(error))), np.mean(inside), offline.warnings(), early
+    return np.sqrt(np.mean(np.square(error))), np.mean(inside), offline.tracker.warnings(), early
 
 
 @pytest.mark.parametrize('name', ['', 'Diver 1'])
@@ -301,7 +301,7 @@ def test_a_track_begins_where_and_when_the_file_says(tmp_path):
         assert first.stamp_ns == START_NS and 2 in first.extras['target_id']
         assert (first.extras['track_state'] == 1).any()
         assert run.recipe()['initial'][0]['position'] == (0.0, 0.0, 0.0)
-        assert run.refusals()['outside']['count'] == 1
+        assert run.refused['outside'].count == 1
         with pytest.raises(BagError, match="no target is called 'anna': bob are known"):
             list(OfflineRun(bag, DIVER, DIVER.config_type()(tags=('bob',)), options).estimates())
 

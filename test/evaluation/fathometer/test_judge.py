@@ -11,6 +11,7 @@
 import json
 
 from attrs import evolve
+from helpers import marine
 import numpy as np
 import pytest
 
@@ -39,7 +40,6 @@ from sonar_imm_tools.evaluation.fathometer.scoring import (
 )
 from sonar_imm_tools.evaluation.judging import judge
 from sonar_imm_tools.offline.run_folder import read_measurements, RunFolder
-from sonar_imm_tools.recordings.conversion import ConversionReport, write_bag
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.own_files import write_own_parameters
 from sonar_imm_tools.recordings.positions import write_position
@@ -212,7 +212,7 @@ def line(folder, name, places, shift=0.0, positions=True, first=0, lower=None):
             records.append((stamp, '/position', write_position(stamp, *place)))
         records.append((stamp, '/trace', write_trace(trace, ros_message)))
     bag = folder / f'{name}.bag'
-    write_bag(bag, records, ConversionReport(bag), source=name)
+    marine.write_bag(bag, records)
     own = {**envelope_parameters(0.5, 0.05), 'particles': 400, 'depth_std': 0.1}
     write_own_parameters(bag, {'fathometer': own})
     assert main(['track', str(bag), str(folder / name)]) == 0
