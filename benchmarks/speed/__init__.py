@@ -24,7 +24,11 @@ from typing import Any
 
 from attrs import frozen
 
-from sonar_imm_tools.evaluation.numbers import flatten
+from sonar_imm.threads import one_blas_thread
+
+one_blas_thread()  # before numpy is imported, as nodes and commands do
+
+from sonar_imm_tools.evaluation.numbers import flatten  # noqa: E402
 
 PEERS = ('filterpy',)
 """Libraries that a bench may need to compare with."""
