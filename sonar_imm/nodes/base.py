@@ -177,7 +177,8 @@ class BaseNode(ManagedNode):
         self._meter.arrived(name, start)
         unused = self.unused()
         self._received_ns = info['received_timestamp']
-        if self._waited_too_long(name, info):
+        waited = self._waited()
+        if self._waited_too_long(name, waited):
             self._acknowledge(stamp)
             return
         try:
@@ -191,8 +192,7 @@ class BaseNode(ManagedNode):
             self._recover(name)
         if stamp is not None:
             # From its reception on: the wait in a full queue would blur whose stamps are whose.
-            queued = (time.time_ns() - self._received_ns) * 1e-9 if self._received_ns else 0.0
-            arrival = time.monotonic() - queued
+            arrival = start - (0.0 if math.isnan(waited) else waited)
             age = arrival - (stamp.sec + 1e-9 * stamp.nanosec)
             used = unused == self.unused()
             self._meter.stamped(name, Stamp(age, message.header.frame_id, used))
@@ -322,12 +322,15 @@ class BaseNode(ManagedNode):
         if self._warming is not None:
             self.reconfigure()
 
-    def _waited_too_long(self, name: str, info: Mapping[str, Any]) -> bool:
+    def _waited(self) -> float:
+        """Seconds of the system's clock since the message in hand was received; NaN where the
+        middleware does not know."""
+        return (time.time_ns() - self._received_ns) * 1e-9 if self._received_ns else math.nan
+
+    def _waited_too_long(self, name: str, waited: float) -> bool:
         """Whether a message lay in the queue for more than `max_wait`; counts it."""
         limit = getattr(self._node_config, 'max_wait', 0.0)
-        arrived_ns = info['received_timestamp']
-        # 0: a middleware that does not know. Both times are those of the system's clock.
-        if not limit or not arrived_ns or time.time_ns() - arrived_ns <= limit * 1e9:
+        if not limit or not waited > limit:
             return False
         if not self._meter.dropped:
             self.get_logger().warning(
@@ -535,9 +538,8 @@ class TrackerNode(BaseNode):
 
     def _note_age(self, stamp_ns: int) -> None:
         """Note how old the newest estimate is, and how long its message waited."""
-        wait = (time.time_ns() - self._received_ns) * 1e-9 if self._received_ns else math.nan
         age = (self.get_clock().now().nanoseconds - stamp_ns) * 1e-9
-        self._meter.estimates.published(time.monotonic(), age, wait)
+        self._meter.estimates.published(time.monotonic(), age, self._waited())
 
     def _doubt(self, name: str, reason: str) -> None:
         if reason not in self._meter.doubted:
