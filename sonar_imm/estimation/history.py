@@ -38,7 +38,8 @@ the newest stamp alone, never on the order of arrival: the scans not older than 
 window``, and one *base* state, that after the last older scan. An item that is still accepted is
 never older than ``newest - window``, so no scan before the base can change any more, and **input
 shuffled inside the window gives the same bits as sorted input**. Where a window holds very many
-scans, only some of the older states are kept; the others are computed again when they are needed.
+scans, only some of the older states are kept; the others are computed again when they are needed,
+and the base is the newest one kept from before the window, with the scans after it.
 
 Times are integer nanoseconds; there is no clock here.
 """
@@ -368,9 +369,9 @@ class ReplayHistory(Generic[State, Item]):
     def _keep(self, revised: list[tuple[int, State]]) -> None:
         """Take over the newest states; of those before, every second one goes while there are too
         many."""
-        for stamp_ns in self._stamps[len(self._stamps) - len(revised) :]:
-            self._states.pop(stamp_ns, None)
-        self._states.update(revised)
+        for stamp_ns, state in revised:
+            self._states.pop(stamp_ns, None)  # so that they stand in the order of their stamps
+            self._states[stamp_ns] = state
         limit = self.state_limit
         while limit is not None and len(self._states) > limit:
             older = list(self._states)[: -(limit // 2)]
