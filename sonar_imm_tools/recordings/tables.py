@@ -85,8 +85,8 @@ _DECIMAL_COMMA = re.compile(r'[-+]?\d*,(\d{1,2}|\d{4,})$')
 NUMBER = re.compile(r'[-+]?(\d+([.,]\d*)?|[.,]\d+)$')
 _ZERO = re.compile(r'[-+]?0*([.,]0*)?$')
 
-_YES_WORDS, _NO_WORDS = (
-    {word for word in words if len(word) > 1 and word.isalpha()} for words in (YES, NO)
+_NO_WORDS, _WORDS = (
+    {word for word in words if len(word) > 1 and word.isalpha()} for words in (NO, (*YES, *NO))
 )
 
 
@@ -397,7 +397,7 @@ class Table:
 
     def has_words(self, name: str) -> bool:
         """Say whether a column holds words for good or bad."""
-        return not self.flags(name).isdisjoint(_YES_WORDS | _NO_WORDS)
+        return not self.flags(name).isdisjoint(_WORDS)
 
     def flags(self, name: str) -> set[str]:
         """Return the words of a column in the rows by which the file is judged."""

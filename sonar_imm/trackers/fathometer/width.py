@@ -72,7 +72,7 @@ class EchoWidth:
         due = float(lag[below[0]]) if len(below) else math.inf
         fits = due / TIMES < half < due * TIMES or max(half, due) < least
         width = 0.0 if fits else max(half, least) / HALF
-        if width and not PULSE_WIDTHS[0] <= width <= PULSE_WIDTHS[1]:
+        if width and not _can_be(width):
             return False
         if abs(width - self.followed) <= CLOSE * self.followed:
             return False
@@ -95,9 +95,14 @@ class EchoWidth:
     def require(self) -> None:
         """Raise ValueError where the state, which may come from a file, is impossible."""
         good = np.isfinite(self._seen).all() and len(self._seen) <= LOOKS[-1]
-        known = self.followed == 0.0 or PULSE_WIDTHS[0] <= self.followed <= PULSE_WIDTHS[1]
+        known = self.followed == 0.0 or _can_be(self.followed)
         if not (good and known and 0.0 <= self.separation <= APART * PULSE_WIDTHS[1]):
             raise ValueError('no echo is as wide as that')
+
+
+def _can_be(width: float) -> bool:
+    """Whether a pulse can be as wide as that, m."""
+    return PULSE_WIDTHS[0] <= width <= PULSE_WIDTHS[1]
 
 
 def half_width(b: FloatArray) -> float:
