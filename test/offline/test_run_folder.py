@@ -9,6 +9,7 @@
 """What a run leaves behind, byte for byte."""
 
 import csv
+import gc
 import json
 import os
 from pathlib import Path
@@ -401,10 +402,17 @@ def test_a_failure_at_each_step_leaves_the_old_or_the_new_whole(
 def killed_in(number, change):
     """Whether a process that makes `change()` is killed in its `number`-th step."""
     if not (child := os.fork()):
+        gc.disable()  # what other tests left behind may have threads, which a fork has not
         failing(pytest.MonkeyPatch(), number, lambda: os.kill(os.getpid(), signal.SIGKILL))
-        change()
-        os._exit(0)
-    return os.waitpid(child, 0)[1] != 0
+        status = 1
+        try:
+            change()
+            status = 0
+        finally:
+            os._exit(status)
+    ended = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert ended in (0, -signal.SIGKILL), ended  # a crash would never come to an end
+    return ended != 0
 
 
 def test_a_kill_at_each_step_leaves_the_old_or_the_new_whole(out, tmp_path, whole_runs):
