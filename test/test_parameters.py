@@ -125,7 +125,7 @@ def test_every_mistake_is_told_at_once():
         "parameter 'speed' must be between 0 and 3, got 9.0 m/s",
         "parameter 'steps' must be at least 1, got 0",
     )
-    assert str(ConfigError(given)) == '; '.join(given)
+    assert str(ConfigError(*given)) == '; '.join(given)
 
 
 def test_unknown_names_may_be_passed_over_but_not_bad_values():

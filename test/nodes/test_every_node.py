@@ -65,9 +65,7 @@ class Fed(Driven):
         return [bytes(write_estimate(estimate, make).data) for estimate in made]
 
 
-@pytest.mark.parametrize(
-    'name, scenario', [*SMALL.items(), ('diver', 'geodetic'), ('obstacle', 'late')]
-)
+@pytest.mark.parametrize('name, scenario', [*SMALL.items(), ('obstacle', 'late')])
 def test_live_is_offline_hostile_input_is_refused_and_services_answer(make_bench, name, scenario):
     """One start of the node, since starting takes longest."""
     driven = Fed(make_bench(), SYSTEMS[name], scenario)
