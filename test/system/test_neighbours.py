@@ -17,8 +17,7 @@ from helpers import interfaces
 from helpers.marine import definitions
 import pytest
 
-pytest.importorskip('rclpy')
-from sonar_imm_tools.replay.harness import reserved_domain_id  # noqa: E402
+from sonar_imm_tools.replay.harness import reserved_domain_id
 
 pytestmark = [
     pytest.mark.system,

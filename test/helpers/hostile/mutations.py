@@ -15,8 +15,7 @@ import numpy as np
 
 from msg_adapters.table import DATATYPES
 
-from .schema import clone, is_bool, is_many, is_sequence, leaves, make, number_type
-from .streams import SECOND
+from .streams import clone, is_bool, is_many, is_sequence, leaves, make, number_type, SECOND
 
 ODD = np.array([
     np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 1.0, 5e-324, 1e-45, 1e-30, 1e-12, 1e-6, 0.5, 3.0,
