@@ -21,7 +21,7 @@ from helpers.node_bench import Bench
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.fls_detector import FlsDetectorNode
-from sonar_imm.nodes.messages import make, message_class
+from sonar_imm.nodes.messages import make
 from sonar_imm.nodes.obstacle import ObstacleNode
 from sonar_imm.nodes.qos import lockstep_qos, transforms_qos
 
@@ -167,37 +167,20 @@ CASES = {
 
 def run(type_name, kind, name, fields, settings):
     """Publish `STEPS` messages to a node of its own, each when the one before is answered."""
-    types = [f'{name}={type_name}', *settings.get('input_types', [])]
-    quality = lockstep_qos()
-    if name == 'sonar_info':
-        quality = transforms_qos()
-        del types[0]
-    settings = {**settings, 'input_types': types}
+    types = [f'{name}={type_name}'] if name != 'sonar_info' else []
+    quality = lockstep_qos() if types else transforms_qos()
+    settings = {**settings, 'input_types': [*types, *settings.get('input_types', [])]}
     bench = Bench()
     try:
         overrides = [Parameter(key, value=value) for key, value in settings.items()]
-        node = bench.add(kind(context=bench.context, parameter_overrides=overrides))
-        places, in_degrees = [], settings.keys() >= GEODETIC.keys()
-        if in_degrees:
-            places = bench.listen(message_class('sensor_msgs/msg/NavSatFix'), '/diver/geo')
-            bench.spin_until(lambda: node.count_subscribers('/diver/geo'))
+        node = bench.start(kind, parameter_overrides=overrides)
         publisher = bench.publisher(type_name, f'/{name}', quality)
         for step in range(STEPS):
             publisher.publish(make(type_name, header=header(step), **fields(step)))
             bench.spin_until(lambda step=step: node.answer()['messages'] > step)
-        if in_degrees:
-            bench.spin_until(lambda: places)
-        return {**node.answer(), **last(places)}
+        return node.answer()
     finally:
         bench.close()
-
-
-def last(places):
-    """The distance between the last place of the diver in degrees and the true one, in metres."""
-    if not places:
-        return {}
-    off = ORIGIN.local(places[-1].latitude, places[-1].longitude, 0.0)[:2] - place(STEPS - 1)[:2]
-    return {'off': float(np.hypot(*off))}
 
 
 if __name__ == '__main__':

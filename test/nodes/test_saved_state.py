@@ -39,9 +39,8 @@ def end(rig):
 def test_a_second_node_with_the_same_file_leaves_it_alone(start, tmp_path, capfd):
     """As two namespaces do that share one parameter file; then the first one ends."""
     first = start()
-    for fix in (a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0)):
-        first.send(fix)
-        first.node._saved_state.save(first.node._config, wait=True)
+    first.send(a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0))
+    first.node._saved_state.save(first.node._config, wait=True)
     assert not (tmp_path / 'state.refused').exists()
     written = (tmp_path / 'state').read_bytes()
     second = start()

@@ -48,15 +48,8 @@ def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(tmp_path):
         run_lockstep(BAGS / 'diver_table1', 'diver', params_file=file)
 
 
-@pytest.mark.parametrize(
-    'arguments, sentence',
-    [
-        (('--params-file', 'nowhere.yaml'), "Couldn't parse params file"),
-        (('--no-such-flag',), '--no-such-flag'),
-        (('--', '-p', 'sound_speed:=1500.0'), "'-p' has to follow --ros-args"),
-    ],
-)
-def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence):
+def test_unusable_arguments_end_in_one_line_and_exit_code_2():
+    arguments = '--params-file', 'nowhere.yaml'
     with (
         reserved_domain_id() as domain,
         NodeProcess('diver', domain_id=domain, arguments=arguments) as node,
@@ -64,7 +57,7 @@ def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence)
         assert node.process.wait(600.0) == 2
         said = own_words(node.log()).splitlines()
         (line,) = (line for line in said if '[rcl]' not in line and 'kernels' not in line)
-    assert sentence in line
+    assert "Couldn't parse params file" in line
 
 
 def test_a_node_under_nohup_outlives_its_terminal():
@@ -192,12 +185,8 @@ def start(tmp_path, monkeypatch):
     with contextlib.ExitStack() as stack:
         domain = stack.enter_context(reserved_domain_id())
         stack.enter_context(local_discovery())
-
-        def begin(system):
-            link = stack.enter_context(Link('asks', domain_id=domain))
-            return stack.enter_context(NodeProcess(system, domain_id=domain)), link
-
-        yield begin
+        link = stack.enter_context(Link('asks', domain_id=domain))
+        yield lambda system: (stack.enter_context(NodeProcess(system, domain_id=domain)), link)
 
 
 def wait_for(node, link, predicate):
@@ -227,20 +216,6 @@ def test_a_node_answers_and_reports_while_it_compiles(start):
     wait_for(node, link, lambda: 'ready, hears' in node.log())
     assert longest < 0.25 * (time.monotonic() - begun)  # however slow the machine is
     assert re.search(r'loading kernels.*\n.*[1-9] kernels compiled, 0 loaded', node.log())
-
-
-def test_a_damaged_folder_ends_a_node_with_one_sentence(start, tmp_path):
-    node, link = start('fathometer')
-    wait_for(node, link, lambda: 'ready, hears' in node.log())
-    for index in (tmp_path / 'kernels').rglob('*.nbi'):
-        index.write_bytes(index.read_bytes()[:-9])
-    node, _ = start('fathometer')
-    assert node.process.wait(LIMIT) == 2
-    folder = re.escape(str(tmp_path / 'kernels'))
-    assert re.search(
-        f'compiled kernels in {folder} cannot be read or kept .*truncated', node.log()
-    )
-    assert 'Traceback' not in node.log()
 
 
 def test_a_node_without_kernels_loads_no_numba(start):

@@ -6,18 +6,16 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""A process that is killed leaves nothing that looks whole; only a process can be killed."""
+"""A process that is killed leaves nothing that looks whole; only a process can be killed. Workers
+that die cost their job only: `offline/test_tracking.py`."""
 
-import contextlib
 import math
-import os
 import random
 import signal
 import subprocess
 import sys
 import time
 
-from helpers.commands import children, contents
 from helpers.dive_bags import write_dive
 from helpers.faults.figures import count
 from helpers.source import ROOT
@@ -49,15 +47,13 @@ def test_track_is_killed_at_any_moment(tmp_path):
     usual = _killed(bag, runs / 'once', math.inf)
     # Half of the moments where the files are written and moved, which is at the end.
     chance = random.Random(14)
-    moments = [0.0, *(chance.uniform(0.0, 1.05) for _ in range(MOMENTS // 2 - 1))]
-    moments += [chance.uniform(0.75, 1.02) for _ in range(MOMENTS - len(moments))]
-    for number, moment in enumerate(moments):
+    for number in range(MOMENTS):
+        moment = chance.uniform(*((0.0, 1.05) if number % 2 else (0.75, 1.02))) * bool(number)
         _killed(bag, runs / f'run{number}', moment * usual)
     whole = sum(whole_run(runs / f'run{number}') for number in range(MOMENTS))
     assert whole < MOMENTS
-    names = {path.name for path in runs.glob('*')} - {'once'}
-    others = {name for name in names if UNFINISHED not in name}
-    assert len(others) == whole and all(name.startswith('run') for name in names)
+    left = {path.name for path in runs.glob('*') if UNFINISHED not in path.name}
+    assert len(left - {'once'}) == whole
 
 
 def _killed(bag, out, moment):
@@ -71,41 +67,3 @@ def _killed(bag, out, moment):
         except subprocess.TimeoutExpired:
             it.send_signal(signal.SIGKILL)
     return time.perf_counter() - begin
-
-
-def test_a_worker_that_is_killed_costs_a_survey_its_job_only(tmp_path):
-    """While lines are read, and while tiles are made."""
-    pytest.importorskip('rasterio')
-    pytest.importorskip('pyarrow')
-    lines = tmp_path / 'lines'
-    small = [f'--set={name}' for name in ('lines=3', 'length=60', 'ghost=false', 'spacing=20')]
-    simulate = command('simulate', 'survey', lines, '--soundings', *small)
-    subprocess.run(simulate, cwd=ROOT, check=True)
-    first, todo = None, [None, 'lines/*.npz', 'tiles/*.npz']
-    for turn in range(30):  # a quick command may have done its work before this process looks
-        work, out = todo[0], tmp_path / f'out{turn}'
-        arguments = command('survey', lines, out, '--adjust', '--jobs', 2)
-        with subprocess.Popen(arguments, cwd=ROOT, stderr=subprocess.PIPE, text=True) as it:
-            while work and it.poll() is None and not list((out / '.work').glob(work)):
-                time.sleep(0.002)
-            workers = _workers(it.pid) if work else []
-            for worker in workers[:1]:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(worker, signal.SIGKILL)
-            error = it.communicate()[1]
-        assert it.returncode == 0 and 'Traceback' not in error, error
-        found = contents(out, 'survey.json')
-        found = {name: content for name, content in found.items() if '.work' not in name}
-        first = first or found
-        assert found == first and 'survey.tif' in found
-        del todo[: not work or len(workers) == 2]
-        if not todo:
-            return
-    pytest.fail(f'no worker was met at {todo}')
-
-
-def _workers(command_id):
-    """The processes that share the work of the command: forks of one that it has started."""
-    with contextlib.suppress(OSError):  # it has ended
-        return [worker for child in children(command_id) for worker in children(child)]
-    return []
