@@ -19,17 +19,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from helpers import marine
+from helpers import marine, sonar_files
 from helpers.dive_scenes import legs
-from helpers.sonar_files import (
-    BEGIN,
-    line_east,
-    place_of,
-    side_scan,
-    write_segy,
-    xtf_head,
-    xtf_soundings,
-)
+from helpers.sonar_files import BEGIN, line_east, place_of
 from msg_adapters.estimates import read_estimate
 from msg_adapters.navigation import write_navigation
 from sonar_imm.measurements import Navigation
@@ -210,7 +202,7 @@ def echoes(count, bins=120):
 def segy(path, spots):
     moments = [BEGIN + timedelta(seconds=each.seconds) for each in spots]
     degrees = np.array([each.degrees for each in spots]).reshape(-1, 2)
-    write_segy(
+    sonar_files.write_segy(
         path, echoes(max(len(spots), 1))[: len(spots)], TRACE_SAMPLE_INTERVAL=266,
         YearDataRecorded=[moment.year for moment in moments],
         DayOfYear=[moment.timetuple().tm_yday for moment in moments],
@@ -343,14 +335,14 @@ def side_scan_xtf(path, spots):
         (each.seconds, place if np.allclose(each.degrees, place, atol=0.01) else each.degrees)
         for each, (_, place) in zip(spots, line_east(len(spots), 0.1))
     ]
-    side_scan(path, spots=towed)
+    sonar_files.side_scan(path, spots=towed)
 
 
 def soundings_xtf(path, spots):
     pytest.importorskip('pyxtf')
     beams = [(0.0, y, 20.0) for y in (-10.0, 0.0, 10.0)]
-    parts = [xtf_head([('port', 'port', 'uint16')]).to_bytes()]
-    parts += [xtf_soundings(each.seconds, beams, each.degrees) for each in spots]
+    parts = [sonar_files.xtf_head([('port', 'port', 'uint16')]).to_bytes()]
+    parts += [sonar_files.xtf_soundings(each.seconds, beams, each.degrees) for each in spots]
     path.write_bytes(b''.join(parts))
 
 
