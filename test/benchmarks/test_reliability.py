@@ -113,26 +113,24 @@ sys.exit(3)
     return tmp_path / 'parts'
 
 
-def run(monkeypatch, *words):
-    monkeypatch.setattr('sys.argv', ['reliability', *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        reliability.main()
-    return ended.value.code
-
-
 def test_parts_are_run_and_what_was_broken_off_goes_on(toy, monkeypatch, capsys):
+    def run(*words):
+        monkeypatch.setattr('sys.argv', ['reliability', str(toy), *words])
+        with pytest.raises(SystemExit) as ended:
+            reliability.main()
+        return ended.value.code
+
     toy.mkdir()
     rows = [{'system': 'diver', 'signal': 'SIGINT', 'tried': 2, 'clean': 2, 'why': []}]
     (toy / 'signals.json').write_text(json.dumps(rows))
-    assert run(monkeypatch, toy, '--run') == 0
+    assert run('--run') == 0
     assert (toy / 'notes').read_text() == 'SIGHUP '  # the other one was there
     assert '4 of 4 nodes ended so: SIGINT, SIGHUP.' in reliability.PAGE.read_text()
     assert 'signals: ended with exit code 3' in capsys.readouterr().out
     rows = json.loads((toy / 'signals.json').read_text())
     rows[0]['clean'] = 1
     (toy / 'signals.json').write_text(json.dumps(rows))
-    assert run(monkeypatch, toy) == 1
-    assert run(monkeypatch, toy, '--run', 'signals') == 0
+    assert run() == 1 and run('--run', 'signals') == 0
     assert (toy / 'notes').read_text() == 'SIGHUP SIGINT '  # what fell short is tried again
 
 
