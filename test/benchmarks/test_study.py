@@ -6,12 +6,15 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The harness of the studies: options from parameters, tables as they come, one file."""
+"""The harness of the studies: options from parameters, tables as they come, one file; and studies
+in their smallest size: each row has its numbers, and the pages find them."""
 
 from collections.abc import Sequence
 from datetime import date
 import functools
+from importlib import import_module
 import json
+import math
 import os
 import runpy
 import shlex
@@ -38,12 +41,9 @@ def test_parts_become_one_file_and_tables(monkeypatch, tmp_path, capsys):
     file = tmp_path / 'folder' / 'numbers.json'
     run(monkeypatch, numbers, '--runs', 2, '--cases', 'a', 'c', '--fast', '--out', file)
     assert study.known(file) == {
-        'runs': 2,
-        'fast': True,
-        'table': {'a': {'error': 0.25, 'n': 2}, 'c': {'error': 0.25, 'n': 2}},
-        'whole': {'x': {'y': 1.0}, 'z': {'y': None}},
-        'list': [1.0, 2.0],
-    }
+        'runs': 2, 'fast': True, 'table': dict.fromkeys('ac', {'error': 0.25, 'n': 2}),
+        'whole': {'x': {'y': 1.0}, 'z': {'y': None}}, 'list': [1.0, 2.0],
+    }  # fmt: skip
     text = capsys.readouterr().out
     assert text.startswith('a: error 0.250, n 2\nc: error 0.250, n 2\n')
     # What came row by row is a table at the end, what came whole is not printed again.
@@ -68,11 +68,12 @@ def test_a_run_is_put_beside_what_is_in_the_file(monkeypatch, tmp_path):
     before = json.loads(file.read_text())['made']
     for _ in range(2):
         run(monkeypatch, numbers, '--cases', 'b', '--runs', 2, '--add', '--out', file)
-    assert study.known(file)['table'] == {
-        'a': {'error': 0.375, 'n': 3},
-        'b': {'error': 0.25, 'n': 2},
-    }
-    made = json.loads(file.read_text())['made']
+    due = {'a': {'error': 0.375, 'n': 3}, 'b': {'error': 0.25, 'n': 2}}
+    assert study.known(file)['table'] == due
+    content = json.loads(file.read_text())
+    made = content['made']
+    assert [*content][0] == 'made' and made['commit']
+    assert made['date'] <= date.today().isoformat()
     assert made['date'] == before['date'] and made['command'].startswith(before['command'] + '; ')
     assert made['command'].count(' at commit ') == 1
 
@@ -117,9 +118,34 @@ def test_the_command_of_every_result_works(command, monkeypatch):
     assert len(taken) == 1
 
 
-def test_a_file_says_how_it_was_made(tmp_path):
-    study.write_json(tmp_path / 'numbers.json', {'n': 1})
-    content = json.loads((tmp_path / 'numbers.json').read_text())
-    assert list(content) == ['made', 'n']
-    assert content['made']['command'].startswith('python ')
-    assert content['made']['commit'] and content['made']['date'] <= date.today().isoformat()
+SMALL = {
+    'bathymetry_paper': ({'pings': 1, 'parts': ['methods']}, {}, 'methods>defaults>patch'),
+    'bathymetry_sea': ({'pings': 2, 'only': 'nadir'}, {}, 'cases>nadir, terrain>rmse_m'),
+    'bathymetry_surfaces': (
+        {'pings': 1},
+        {'SIZES': {'ledge': (2.0, 3.0)}, 'BANDS': ((17.0, 77.0),)}
+        | {'SETTINGS': {'8 staves': {}}, 'FLOORS': {'flat': ('thermal', {'patch_std': 0.0})}},
+        'resolved>ledge, 8 staves>rmse_m',
+    ),
+    'fathometer_gaps': (
+        {'runs': 1, 'particles': 200, 'drawn': 2, 'cases': ['30 missing, walk 0.1 m']},
+        {},
+        'table>30 missing, walk 0.1 m, Kalman>inside',
+    ),
+    'obstacle_accuracy': ({'runs': 5, 'cases': ['images']}, {}, 'images>found>steady>21 dB'),
+}
+"""Options, what is made smaller besides, and a number."""
+
+
+@pytest.mark.parametrize('name', SMALL)
+def test_a_small_study_has_its_numbers(name, monkeypatch):
+    options, changes, place = SMALL[name]
+    module = import_module(f'benchmarks.{name}')
+    for key, value in changes.items():
+        monkeypatch.setattr(module, key, value)
+    found = {}
+    for part in module.main(**options):
+        study.merge(found, part)
+    for key in place.split('>'):
+        found = next(iter(found.values())) if key == '*' else found[key]
+    assert math.isfinite(found)

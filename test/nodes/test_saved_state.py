@@ -27,35 +27,15 @@ pytestmark = pytest.mark.usefixtures('walker')
 @pytest.fixture
 def start(make_bench, tmp_path):
     """Start a rig whose node keeps its state in `tmp_path`, with more parameters."""
-
-    def begin(*given, file='state'):
-        words = [
-            word for item in (f'state_file:={tmp_path / file}', *given) for word in ('-p', item)
-        ]
-        return Rig(make_bench(*words))
-
-    return begin
-
-
-def end(rig):
-    """Stop the node, so that it saves."""
-    rig.bench.nodes.remove(rig.node)
-    rig.bench.executor.remove_node(rig.node)
-    rig.node.destroy_node()
-
-
-def kill(rig):
-    """What the file sees of a node whose process is killed."""
-    rig.node._saved_state.close()
+    return lambda *given: Rig(make_bench(p=[f'state_file:={tmp_path / "state"}', *given]))
 
 
 @pytest.mark.skipif(fcntl is None, reason='there are no locks')
 def test_a_second_node_with_the_same_file_leaves_it_alone(start, tmp_path, capfd):
     """As two namespaces do that share one parameter file; then the first one ends."""
     first = start()
-    for fix in (a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0)):
-        first.send(fix)
-        first.node._saved_state.save(first.node._config, wait=True)
+    first.send(a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0))
+    first.node._saved_state.save(first.node._config, wait=True)
     assert not (tmp_path / 'state.refused').exists()
     written = (tmp_path / 'state').read_bytes()
     second = start()
@@ -64,19 +44,21 @@ def test_a_second_node_with_the_same_file_leaves_it_alone(start, tmp_path, capfd
     second.send(a_fix(3.0, 4.0, 4.0))
     second.node._saved_state.save(second.node._config, wait=True)
     assert (tmp_path / 'state').read_bytes() == written
-    end(first)
+    first.end()
     second.send(a_fix(4.0, 4.0, 4.0))
-    end(second)
+    second.end()
     assert not capfd.readouterr().err.count('another node')
     assert read_state(tmp_path / 'state').newest_ns == 4 * 10**9
     assert read_state(tmp_path / 'state.refused').newest_ns == 2 * 10**9
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_node_that_is_started_again_goes_on(start, tmp_path):
+def test_a_node_that_is_started_again_goes_on_and_a_reset_is_kept(start, tmp_path):
     rig = start()
+    rig.send(a_fix(0.5, 9.0, 9.0))
+    rig.bench.call(Trigger, '/walker/reset', Trigger.Request())
     rig.send(a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0))
-    end(rig)
+    rig.end()
     assert [path.name for path in tmp_path.iterdir()] == ['state']
     again = start()
     again.send(a_fix(2.0, 2.0, 8.0), a_fix(3.0, 4.0, 4.0), a_fix(4.0, 2.0, 0.0, 'odom'))
@@ -100,24 +82,13 @@ def test_states_are_saved_while_running_and_only_when_something_was_heard(start,
     assert read_state(tmp_path / 'state').newest_ns == 10**9
 
 
-def test_reset_is_kept_too(start):
-    rig = start()
-    rig.send(a_fix(1.0, 9.0, 9.0))
-    rig.bench.call(Trigger, '/walker/reset', Trigger.Request())
-    rig.send(a_fix(2.0, 1.0, 1.0))
-    end(rig)
-    again = start()
-    again.send(a_fix(3.0, 3.0, 3.0))
-    assert again.means() == [(3.0, 2.0, 2.0)]
-
-
 def test_files_that_cannot_be_used_are_named_and_kept(start, tmp_path, capfd):
     (tmp_path / 'state').write_text('shopping list')
     rig = start()
     assert 'is not used: it is no state of a tracker' in capfd.readouterr().err
     assert (tmp_path / 'state').read_text() == 'shopping list'
     rig.send(a_fix(1.0))
-    end(rig)
+    rig.end()
     assert (tmp_path / 'state.refused').read_text() == 'shopping list'
     assert read_state(tmp_path / 'state').system == 'walker'
 
@@ -126,7 +97,7 @@ def test_a_state_that_does_not_go_with_what_is_measured_is_given_up(start, tmp_p
     """It loads, and the tracker raises at the first measurement: the node goes on without it."""
     rig = start()
     rig.send(a_fix(1.0))
-    end(rig)
+    rig.end()
     header, arrays = parts_of(tmp_path / 'state')
     header['state']['tracker']['fixes'] = [[1, 'a fix']]
     forge(tmp_path / 'state', header, arrays)
@@ -136,7 +107,7 @@ def test_a_state_that_does_not_go_with_what_is_measured_is_given_up(start, tmp_p
     assert said.count('does not go with what is measured (AttributeError)') == 1
     assert 'Traceback' not in said and 'internal error' not in said
     assert sorted(again.node.tracker.fixes) == [3 * 10**9, 4 * 10**9]
-    end(again)
+    again.end()
     assert read_state(tmp_path / 'state').newest_ns == 4 * 10**9
     assert (tmp_path / 'state.refused').exists()
 
@@ -144,18 +115,18 @@ def test_a_state_that_does_not_go_with_what_is_measured_is_given_up(start, tmp_p
 def test_other_parameters_and_old_states_are_not_used(start, tmp_path, capfd, monkeypatch):
     rig = start()
     rig.send(a_fix(1.0))
-    end(rig)
-    end(start('steps:=4'))
+    rig.end()
+    start('steps:=4').end()
     assert 'other parameters: steps was 3, is 4' in capfd.readouterr().err
-    end(start('frame_id:=map'))
+    start('frame_id:=map').end()
     assert 'another frame_id or world_frame_convention' in capfd.readouterr().err
     now = time.time_ns()
     with monkeypatch.context() as clock:
         clock.setattr('time.time_ns', lambda: now + 400 * 10**9)
-        end(start())
+        start().end()
         assert re.search('saved 4.. s ago, state_max_age is 300 s', capfd.readouterr().err)
         clock.setattr('time.time_ns', lambda: now - 500 * 10**9)
-        end(start())
+        start().end()
         assert 's ahead of the clock' in capfd.readouterr().err
     start('slow_share:=0.5', 'fast_share:=0.5')
     assert 'goes on from the state' in capfd.readouterr().err
@@ -164,18 +135,18 @@ def test_other_parameters_and_old_states_are_not_used(start, tmp_path, capfd, mo
 def test_measurements_of_another_time_end_the_state_and_one_outlier_does_not(start, capfd):
     rig = start()
     rig.send(a_fix(1000.0, 9.0, 9.0))
-    end(rig)
+    rig.end()
     again = start()
     again.send(a_fix(5000.0), a_fix(1001.0, 1.0, 1.0))
     assert again.node._saved_state._loaded_ns is None
     assert again.means()[-1][0] == 5000.0 and len(again.node.tracker.fixes) == 3
-    kill(again)
+    again.node._saved_state.close()  # what the file sees of a process that is killed
     capfd.readouterr()
     other = start()
     other.send(*[a_fix(5000.0 + k, 1.0, 1.0) for k in range(4)])
     assert 'are +4002 s from the last one of the state' in capfd.readouterr().err
     assert sorted(other.node.tracker.fixes) == [5002 * 10**9, 5003 * 10**9]
-    end(other)
+    other.end()
     earlier = start()
     earlier.send(*[a_fix(100.0 + k, 1.0, 1.0) for k in range(3)])
     assert 'are -4901 s from the last one of the state' in capfd.readouterr().err
@@ -204,12 +175,8 @@ def test_a_disk_that_is_full_is_said(start, monkeypatch, capfd):
 
 @pytest.mark.parametrize(
     'file, sentence',
-    [
-        ('/nowhere/at/all/state', 'there is no folder'),
-        ('~nobody-here/state', 'stands for no folder'),
-    ],
+    [('/nowhere/state', 'there is no folder'), ('~nobody-here/state', 'stands for no folder')],
 )
 def test_a_folder_that_is_not_there_ends_the_node(make_bench, file, sentence):
-    bench = make_bench('-p', f'state_file:={file}')
     with pytest.raises(ConfigError, match=sentence):
-        TrackerNode('walker', context=bench.context)
+        make_bench(p=[f'state_file:={file}']).start(TrackerNode, 'walker')
