@@ -10,9 +10,11 @@
 
 from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
+from functools import reduce
 import itertools
 import json
 import math
+from operator import xor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -56,6 +58,10 @@ class Spot(NamedTuple):
         return (0.0, 0.0) if self.place is None else place_of(*self.place)
 
     @property
+    def moment(self):
+        return BEGIN + timedelta(seconds=self.seconds)
+
+    @property
     def time(self):
         moment = np.datetime64(FIRST, 's') + np.timedelta64(round(1e3 * self.seconds), 'ms')
         return f'{moment}Z'
@@ -97,13 +103,13 @@ def of_each(spots):
 
 
 def gpx(path, spots):
+    def point(e):
+        lat, lon = e.degrees
+        return f'<trkpt lat="{lat:.8f}" lon="{lon:.8f}"><time>{e.time}</time></trkpt>\n'
+
     tracks = ''
     for name, own in of_each(spots):
-        points = ''.join(
-            '<trkpt lat="{:.8f}" lon="{:.8f}">'.format(*each.degrees)
-            + f'<time>{each.time}</time></trkpt>\n'
-            for each in own
-        )
+        points = ''.join(map(point, own))
         tracks += f'<trk><name>{name}</name><trkseg>{points}</trkseg></trk>'
     path.write_text(f'<gpx xmlns="http://www.topografix.com/GPX/1/1">{tracks}</gpx>')
 
@@ -123,21 +129,16 @@ def kml(path, spots):
 
 
 def geojson(path, spots):
-    features = [
-        {
-            'type': 'Feature', 'properties': {'time': each.time, 'id': each.name},
-            'geometry': {'type': 'Point', 'coordinates': list(each.degrees[::-1])},
-        }
-        for each in spots
-    ]  # fmt: skip
+    features = []
+    for each in spots:
+        place = {'type': 'Point', 'coordinates': list(each.degrees[::-1])}
+        known = {'time': each.time, 'id': each.name}
+        features.append({'type': 'Feature', 'properties': known, 'geometry': place})
     path.write_text(json.dumps({'type': 'FeatureCollection', 'features': features}, indent=1))
 
 
 def checked(text):
-    total = 0
-    for letter in text:
-        total ^= ord(letter)
-    return f'${text}*{total:02X}'
+    return f'${text}*{reduce(xor, text.encode("latin-1")):02X}'
 
 
 def minutes(value, width):
@@ -149,10 +150,10 @@ def nmea(path, spots):
     pytest.importorskip('pyais')
     lines = []
     for each in spots:
-        moment = BEGIN + timedelta(seconds=each.seconds)
         where = f'{minutes(each.degrees[0], 2)},N,{minutes(each.degrees[1], 3)},E'
-        lines.append(checked(f'GPRMC,{moment:%H%M%S}.00,A,{where},1.0,90.0,{moment:%d%m%y},,'))
-        lines.append(checked(f'GPGGA,{moment:%H%M%S}.00,{where},4,08,0.9,2.0,M,40.0,M,,'))
+        clock, day = f'{each.moment:%H%M%S}.00', f'{each.moment:%d%m%y}'
+        lines.append(checked(f'GPRMC,{clock},A,{where},1.0,90.0,{day},,'))
+        lines.append(checked(f'GPGGA,{clock},{where},4,08,0.9,2.0,M,40.0,M,,'))
     path.write_text('\r\n'.join(lines) + '\r\n')
 
 
@@ -189,9 +190,8 @@ def telemetry(path, spots):
 
 def arrivals(path, spots):
     stations(path.parent)
-    rows = [
-        f'{k},{number},{FIRST + t:.6f},{each.name}' for k, each, number, t in receptions(spots)
-    ]
+    heard = receptions(spots)
+    rows = [f'{k},{number},{FIRST + t:.6f},{each.name}' for k, each, number, t in heard]
     csv(path, 'ping,receiver,arrival_s,tag', rows)
 
 
@@ -211,25 +211,21 @@ def sound(path, spots):
 
 def echoes(count, bins=120):
     """Envelopes (count, bins) of a floor and a layer below it."""
-    at = np.arange(bins)
-    row = 1000.0 * np.exp(-0.5 * ((at - 30) / 1.5) ** 2)
-    row = row + 300.0 * np.exp(-0.5 * ((at - 70) / 1.5) ** 2)
+    floor, layer = (np.exp(-0.5 * ((np.arange(bins) - at) / 1.5) ** 2) for at in (30, 70))
     noise = np.random.default_rng(6).rayleigh(5.0, (count, bins))
-    return row + noise
+    return 1000.0 * floor + 300.0 * layer + noise
 
 
 def segy(path, spots):
-    moments = [BEGIN + timedelta(seconds=each.seconds) for each in spots]
+    days = [each.moment.timetuple() for each in spots]
     degrees = np.array([each.degrees for each in spots]).reshape(-1, 2)
+    north, east = np.round(3.6e6 * degrees.T).astype(int)
     write_segy(
         path, echoes(max(len(spots), 1))[: len(spots)], TRACE_SAMPLE_INTERVAL=266,
-        YearDataRecorded=[moment.year for moment in moments],
-        DayOfYear=[moment.timetuple().tm_yday for moment in moments],
-        HourOfDay=[moment.hour for moment in moments],
-        MinuteOfHour=[moment.minute for moment in moments],
-        SecondOfMinute=[moment.second for moment in moments], SourceGroupScalar=-1000,
-        CoordinateUnits=2, SourceX=np.round(3.6e6 * degrees[:, 1]).astype(int),
-        SourceY=np.round(3.6e6 * degrees[:, 0]).astype(int),
+        YearDataRecorded=[day.tm_year for day in days], DayOfYear=[day.tm_yday for day in days],
+        HourOfDay=[day.tm_hour for day in days], MinuteOfHour=[day.tm_min for day in days],
+        SecondOfMinute=[day.tm_sec for day in days], SourceGroupScalar=-1000,
+        CoordinateUnits=2, SourceX=east, SourceY=north,
     )  # fmt: skip
 
 
@@ -242,10 +238,13 @@ def traces_csv(path, spots):
     csv(path, 'time_utc,depth,amplitude', rows)
 
 
+def stamps_of(spots):
+    return np.array([FIRST + each.seconds for each in spots])
+
+
 def traces_npz(path, spots):
-    stamp = np.array([FIRST + each.seconds for each in spots])
     depth = 20.0 + 0.2 * np.arange(120)
-    np.savez(path, depth=depth, amplitude=echoes(len(spots)), stamp=stamp)
+    np.savez(path, depth=depth, amplitude=echoes(len(spots)), stamp=stamps_of(spots))
 
 
 def floor(count, staves):
@@ -264,9 +263,8 @@ def floor(count, staves):
 
 def snapshots_npz(path, spots):
     iq, distance = floor(len(spots), 4)
-    stamp = np.array([FIRST + each.seconds for each in spots])
     facts = {'sound_speed': 1500.0, 'frequency': 300e3, 'spacing_wavelengths': 0.5}
-    np.savez(path, iq=iq[:, 140:], range=distance[140:], stamp=stamp, **facts)
+    np.savez(path, iq=iq[:, 140:], range=distance[140:], stamp=stamps_of(spots), **facts)
 
 
 def measured(path, system='diver', topics=None):
@@ -289,10 +287,8 @@ def bag_of(path, spots, messages, types=None):
 
 
 def pose_at(stamp, x):
-    pose = Navigation(
-        stamp_ns=stamp, position=[x, 0.0, -20.0], orientation=[0, 0, 0, 1.0], frame_id='odom'
-    )
-    return write_navigation(pose, ros_message)
+    place = {'position': [x, 0.0, -20.0], 'orientation': [0, 0, 0, 1.0], 'frame_id': 'odom'}
+    return write_navigation(Navigation(stamp_ns=stamp, **place), ros_message)
 
 
 def images_bag(path, spots):
@@ -336,18 +332,14 @@ def phases_bag(path, spots):
 
 
 def cloud_bag(path, spots):
-    types = marine.typestore()
+    types, package = marine.typestore(), 'sensor_msgs/msg'
     text = 'std_msgs/Header header\ngeometry_msgs/Point32[] points\n'
     text += 'sensor_msgs/ChannelFloat32[] channels'
-    for name, each in (
-        ('sensor_msgs/msg/ChannelFloat32', 'string name\nfloat32[] values'),
-        ('sensor_msgs/msg/PointCloud', text),
-    ):
-        if name not in types.types:
-            types.register(get_types_from_msg(each, name))
-    point, cloud = (
-        types.types[name] for name in ('geometry_msgs/msg/Point32', 'sensor_msgs/msg/PointCloud')
-    )
+    known = {'ChannelFloat32': 'string name\nfloat32[] values', 'PointCloud': text}
+    for name, fields in known.items():
+        if f'{package}/{name}' not in types.types:
+            types.register(get_types_from_msg(fields, f'{package}/{name}'))
+    point, cloud = types.types['geometry_msgs/msg/Point32'], types.types[f'{package}/PointCloud']
 
     def messages(each, stamp):
         yield '/auv/odometry', pose_at(stamp, 0.5 * each.seconds)
