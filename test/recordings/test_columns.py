@@ -279,45 +279,40 @@ def test_metres_and_degrees_that_disagree_are_a_question(convert):
         assert column in notes['columns of in.csv']
 
 
-@pytest.mark.parametrize(
-    'header, start, step, words, answer',
-    [
-        ('x,y', (-10.25, 54.5), 1e-5, 'as degrees do.*--column longitude=x', 'latitude=y'),
-        ('x,y', (-10.25, 54.5), 1e-5, 'or for metres --column x=x --column y=y', 'y=y'),
-        ('lat,lon', (0.951204, -0.178896), 1.6e-7, 'degrees or radians', 'latitude_rad'),
-        ('x,y', (-10.25, 54.5), 0.3, '', ''),
-        ('x [m],y [m]', (-10.25, 54.5), 1e-5, '', ''),
-        ('lat_rad,lon_rad', (0.951204, -0.178896), 1.6e-7, '', ''),
+def test_degrees_that_are_called_otherwise_are_a_question(convert):
+    degrees, radians = (-10.25, 54.5), (0.951204, -0.178896)
+    for k, (header, (x, y), step, words, answer) in enumerate((
+        ('x,y', degrees, 1e-5, 'as degrees do.*--column longitude=x', 'latitude=y'),
+        ('x,y', degrees, 1e-5, 'or for metres --column x=x --column y=y', 'y=y'),
+        ('lat,lon', radians, 1.6e-7, 'degrees or radians', 'latitude_rad'),
+        ('x,y', degrees, 0.3, '', ''), ('x [m],y [m]', degrees, 1e-5, '', ''),
+        ('lat_rad,lon_rad', radians, 1.6e-7, '', ''),
         ('lat,lon', (0.951204, -3.178896), 1e-5, '', ''),
-    ],
-)
-def test_degrees_that_are_called_otherwise_are_a_question(
-    convert, header, start, step, words, answer
-):
-    rows = ''.join(f'{k},{start[0]:.9f},{start[1] + step * k:.9f}\n' for k in range(9))
-    text = f'time,{header}\n{rows}'
-    if words:
-        with pytest.raises(BagError, match=words) as caught:
-            convert(text)
-        assert answer in str(caught.value)
-    how = CsvOptions(columns={'x': 'x', 'y': 'y'} if answer == 'y=y' else {})
-    if not words or answer == 'y=y':
-        assert convert(text, options=how).messages == {'/fix': 9}
+    )):  # fmt: skip
+        text = f'time,{header}\n' + ''.join(f'{k},{x:.9f},{y + step * k:.9f}\n' for k in range(9))
+        if words:
+            with pytest.raises(BagError, match=words) as caught:
+                convert(text)
+            assert answer in str(caught.value)
+        how = CsvOptions(columns={'x': 'x', 'y': 'y'} if answer == 'y=y' else {})
+        if not words or answer == 'y=y':
+            assert convert(text, out=f'{k}', options=how).messages == {'/fix': 9}
 
 
-@pytest.mark.parametrize('places', ['lat;lon', 'Breite;Länge', 'x;y'])
-def test_positions_beside_range_and_bearing_are_a_question(convert, places):
+def test_positions_beside_range_and_bearing_are_a_question(convert):
     """Those of the target or those of a vessel: each reading has its option."""
     rows = ''.join(f'{k};59.4;10.{k};{80 + k * k};50;{k}0\n' for k in range(1, 9))
-    text = f'time;{places};heading;range;bearing_deg\n{rows}'
-    with pytest.raises(BagError) as caught:
-        convert(text)
-    sentence = caught.value.sentence
-    assert '--ignore range' in sentence and 'convert relative' in sentence
-    assert convert(text, options=CsvOptions(ignore=['range'])).messages == {'/fix': 8}
-    pairs = re.findall("--column '(vessel_[a-z]+)=([^']+)'", sentence)
-    how = CsvOptions(columns=dict(pairs))
-    assert convert(text, 'relative', 'vessel', options=how).messages['/relative'] == 8
+    for places in ('lat;lon', 'Breite;Länge', 'x;y'):
+        text = f'time;{places};heading;range;bearing_deg\n{rows}'
+        with pytest.raises(BagError) as caught:
+            convert(text)
+        sentence = caught.value.sentence
+        assert '--ignore range' in sentence and 'convert relative' in sentence
+        how = CsvOptions(ignore=['range'])
+        assert convert(text, out=places, options=how).messages == {'/fix': 8}
+        pairs = re.findall("--column '(vessel_[a-z]+)=([^']+)'", sentence)
+        how = CsvOptions(columns=dict(pairs))
+        assert convert(text, 'relative', f'{places}2', options=how).messages['/relative'] == 8
 
 
 @pytest.mark.parametrize(
@@ -416,20 +411,18 @@ def test_letters_below_n_and_e_are_hemispheres_and_an_altitude_beside_a_depth_is
     assert measured(report.path)[0].position == pytest.approx([0.0, 0.0, -12.5], abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    'header, ranges, x',
-    [
-        ('slant range', '', 40.0), ('Distance oblique (m)', '', 40.0), ('range', 'slant', 40.0),
-        ('range', 'horizontal', 50.0), ('horizontal range', '', 50.0), ('range', '', None),
-    ],
-)  # fmt: skip
-def test_ranges_are_slant_or_horizontal_where_the_depth_matters(convert, header, ranges, x):
-    text = f'time,{header},bearing_deg,depth\n1,50,90,30\n2,50,90,30\n'
-    how = {'bearings': 'north', **({'ranges': ranges} if ranges else {})}
-    if x is not None:
-        assert measured(convert(text, **how).path)[0].position == pytest.approx([x, 0.0, -30.0])
-        return
-    with pytest.raises(BagError, match='say --ranges slant or --ranges horizontal'):
-        convert(text, **how)
-    report = convert('time,range,bearing_deg,depth\n1,50,90,3\n2,50,90,3\n')  # hardly matters
-    assert measured(report.path)[0].position[0] == pytest.approx(50.0)
+def test_ranges_are_slant_or_horizontal_where_the_depth_matters(convert):
+    for header, ranges, depth, x in (
+        ('slant range', '', 30, 40.0), ('Distance oblique (m)', '', 30, 40.0),
+        ('range', 'slant', 30, 40.0), ('range', 'horizontal', 30, 50.0),
+        ('horizontal range', '', 30, 50.0), ('range', '', 30, None),
+        ('range', '', 3, 50.0),  # hardly matters
+    ):  # fmt: skip
+        text = f'time,{header},bearing_deg,depth\n1,50,90,{depth}\n2,50,90,{depth}\n'
+        how = {'out': f'{header}{ranges}{depth}', **({'ranges': ranges} if ranges else {})}
+        if x is None:
+            with pytest.raises(BagError, match='say --ranges slant or --ranges horizontal'):
+                convert(text, bearings='north', **how)
+        else:
+            place = measured(convert(text, bearings='north', **how).path)[0].position
+            assert place == pytest.approx([x, 0.0, -depth], abs=0.1 * (depth == 3))
