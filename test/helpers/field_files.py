@@ -10,29 +10,18 @@
 
 from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
-from functools import reduce
 import itertools
 import json
 import math
-from operator import xor
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from rosbags.typesys import get_types_from_msg
 
-from helpers import marine
+from helpers import marine, sonar_files
 from helpers.dive_scenes import legs
-from helpers.sonar_files import (
-    BEGIN,
-    line_east,
-    place_of,
-    side_scan,
-    write_segy,
-    xtf_head,
-    xtf_soundings,
-)
+from helpers.sonar_files import BEGIN, line_east, place_of
 from msg_adapters.estimates import read_estimate
 from msg_adapters.navigation import write_navigation
 from sonar_imm.measurements import Navigation
@@ -56,10 +45,6 @@ class Spot(NamedTuple):
     @property
     def degrees(self):
         return (0.0, 0.0) if self.place is None else place_of(*self.place)
-
-    @property
-    def moment(self):
-        return BEGIN + timedelta(seconds=self.seconds)
 
     @property
     def time(self):
@@ -91,10 +76,9 @@ def usbl_csv(path, spots):
 
 
 def vessel_csv(path, spots):
-    head = 'time,vessel_latitude,vessel_longitude,heading,range,bearing_deg,id'
     row = '{},{:.8f},{:.8f},90,{:.2f},45,{}'
     rows = [row.format(e.time, *e.degrees, 30 + 0.2 * k, e.name) for k, e in enumerate(spots)]
-    csv(path, head, rows)
+    csv(path, 'time,vessel_latitude,vessel_longitude,heading,range,bearing_deg,id', rows)
 
 
 def of_each(spots):
@@ -103,24 +87,18 @@ def of_each(spots):
 
 
 def gpx(path, spots):
-    def point(e):
-        lat, lon = e.degrees
-        return f'<trkpt lat="{lat:.8f}" lon="{lon:.8f}"><time>{e.time}</time></trkpt>\n'
-
-    tracks = ''
+    tracks, point = '', '<trkpt lat="{:.8f}" lon="{:.8f}"><time>{}</time></trkpt>\n'
     for name, own in of_each(spots):
-        points = ''.join(map(point, own))
+        points = ''.join(point.format(*each.degrees, each.time) for each in own)
         tracks += f'<trk><name>{name}</name><trkseg>{points}</trkseg></trk>'
     path.write_text(f'<gpx xmlns="http://www.topografix.com/GPX/1/1">{tracks}</gpx>')
 
 
 def kml(path, spots):
-    marks = ''
+    marks, coord = '', '<gx:coord>{1:.8f} {0:.8f} 0</gx:coord>\n'
     for name, own in of_each(spots):
         whens = ''.join(f'<when>{each.time}</when>\n' for each in own)
-        coords = ''.join(
-            '<gx:coord>{1:.8f} {0:.8f} 0</gx:coord>\n'.format(*e.degrees) for e in own
-        )
+        coords = ''.join(coord.format(*each.degrees) for each in own)
         marks += f'<Placemark><name>{name}</name><gx:Track>{whens}{coords}</gx:Track></Placemark>'
     path.write_text(
         '<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">'
@@ -129,16 +107,21 @@ def kml(path, spots):
 
 
 def geojson(path, spots):
-    features = []
-    for each in spots:
-        place = {'type': 'Point', 'coordinates': list(each.degrees[::-1])}
-        known = {'time': each.time, 'id': each.name}
-        features.append({'type': 'Feature', 'properties': known, 'geometry': place})
+    features = [
+        {
+            'type': 'Feature', 'properties': {'time': each.time, 'id': each.name},
+            'geometry': {'type': 'Point', 'coordinates': list(each.degrees[::-1])},
+        }
+        for each in spots
+    ]  # fmt: skip
     path.write_text(json.dumps({'type': 'FeatureCollection', 'features': features}, indent=1))
 
 
 def checked(text):
-    return f'${text}*{reduce(xor, text.encode("latin-1")):02X}'
+    total = 0
+    for letter in text:
+        total ^= ord(letter)
+    return f'${text}*{total:02X}'
 
 
 def minutes(value, width):
@@ -150,10 +133,10 @@ def nmea(path, spots):
     pytest.importorskip('pyais')
     lines = []
     for each in spots:
+        moment = BEGIN + timedelta(seconds=each.seconds)
         where = f'{minutes(each.degrees[0], 2)},N,{minutes(each.degrees[1], 3)},E'
-        clock, day = f'{each.moment:%H%M%S}.00', f'{each.moment:%d%m%y}'
-        lines.append(checked(f'GPRMC,{clock},A,{where},1.0,90.0,{day},,'))
-        lines.append(checked(f'GPGGA,{clock},{where},4,08,0.9,2.0,M,40.0,M,,'))
+        lines.append(checked(f'GPRMC,{moment:%H%M%S}.00,A,{where},1.0,90.0,{moment:%d%m%y},,'))
+        lines.append(checked(f'GPGGA,{moment:%H%M%S}.00,{where},4,08,0.9,2.0,M,40.0,M,,'))
     path.write_text('\r\n'.join(lines) + '\r\n')
 
 
@@ -177,22 +160,20 @@ def receptions(spots):
             yield k, each, number, each.seconds + np.linalg.norm(station - place) / 1500.0
 
 
-def stations(folder):
+def heard(path, spots, head, row):
+    """Receptions, and beside the file where the stations are."""
     rows = ['{},{:.9f},{:.9f}'.format(k, *place_of(*place)) for k, place in enumerate(STATIONS)]
-    csv(folder / 'stations.csv', 'receiver,latitude,longitude', rows)
+    csv(path.with_name('stations.csv'), 'receiver,latitude,longitude', rows)
+    given = receptions(spots)
+    csv(path, head, [row.format(k, number, FIRST + t, each.name) for k, each, number, t in given])
 
 
 def telemetry(path, spots):
-    stations(path.parent)
-    rows = [f'{FIRST + t:.6f},{number},{each.name}' for _, each, number, t in receptions(spots)]
-    csv(path, 'time_utc,receiver,tag', rows)
+    heard(path, spots, 'time_utc,receiver,tag', '{2:.6f},{1},{3}')
 
 
 def arrivals(path, spots):
-    stations(path.parent)
-    heard = receptions(spots)
-    rows = [f'{k},{number},{FIRST + t:.6f},{each.name}' for k, each, number, t in heard]
-    csv(path, 'ping,receiver,arrival_s,tag', rows)
+    heard(path, spots, 'ping,receiver,arrival_s,tag', '{0},{1},{2:.6f},{3}')
 
 
 def shipped_sound(most=None):
@@ -211,21 +192,25 @@ def sound(path, spots):
 
 def echoes(count, bins=120):
     """Envelopes (count, bins) of a floor and a layer below it."""
-    floor, layer = (np.exp(-0.5 * ((np.arange(bins) - at) / 1.5) ** 2) for at in (30, 70))
+    at = np.arange(bins)
+    row = 1000.0 * np.exp(-0.5 * ((at - 30) / 1.5) ** 2)
+    row = row + 300.0 * np.exp(-0.5 * ((at - 70) / 1.5) ** 2)
     noise = np.random.default_rng(6).rayleigh(5.0, (count, bins))
-    return 1000.0 * floor + 300.0 * layer + noise
+    return row + noise
 
 
 def segy(path, spots):
-    days = [each.moment.timetuple() for each in spots]
+    moments = [BEGIN + timedelta(seconds=each.seconds) for each in spots]
     degrees = np.array([each.degrees for each in spots]).reshape(-1, 2)
-    north, east = np.round(3.6e6 * degrees.T).astype(int)
-    write_segy(
+    sonar_files.write_segy(
         path, echoes(max(len(spots), 1))[: len(spots)], TRACE_SAMPLE_INTERVAL=266,
-        YearDataRecorded=[day.tm_year for day in days], DayOfYear=[day.tm_yday for day in days],
-        HourOfDay=[day.tm_hour for day in days], MinuteOfHour=[day.tm_min for day in days],
-        SecondOfMinute=[day.tm_sec for day in days], SourceGroupScalar=-1000,
-        CoordinateUnits=2, SourceX=east, SourceY=north,
+        YearDataRecorded=[moment.year for moment in moments],
+        DayOfYear=[moment.timetuple().tm_yday for moment in moments],
+        HourOfDay=[moment.hour for moment in moments],
+        MinuteOfHour=[moment.minute for moment in moments],
+        SecondOfMinute=[moment.second for moment in moments], SourceGroupScalar=-1000,
+        CoordinateUnits=2, SourceX=np.round(3.6e6 * degrees[:, 1]).astype(int),
+        SourceY=np.round(3.6e6 * degrees[:, 0]).astype(int),
     )  # fmt: skip
 
 
@@ -238,13 +223,9 @@ def traces_csv(path, spots):
     csv(path, 'time_utc,depth,amplitude', rows)
 
 
-def stamps_of(spots):
-    return np.array([FIRST + each.seconds for each in spots])
-
-
 def traces_npz(path, spots):
-    depth = 20.0 + 0.2 * np.arange(120)
-    np.savez(path, depth=depth, amplitude=echoes(len(spots)), stamp=stamps_of(spots))
+    stamp, depth = np.array([FIRST + each.seconds for each in spots]), 20.0 + 0.2 * np.arange(120)
+    np.savez(path, depth=depth, amplitude=echoes(len(spots)), stamp=stamp)
 
 
 def floor(count, staves):
@@ -263,8 +244,9 @@ def floor(count, staves):
 
 def snapshots_npz(path, spots):
     iq, distance = floor(len(spots), 4)
+    stamp = np.array([FIRST + each.seconds for each in spots])
     facts = {'sound_speed': 1500.0, 'frequency': 300e3, 'spacing_wavelengths': 0.5}
-    np.savez(path, iq=iq[:, 140:], range=distance[140:], stamp=stamps_of(spots), **facts)
+    np.savez(path, iq=iq[:, 140:], range=distance[140:], stamp=stamp, **facts)
 
 
 def measured(path, system='diver', topics=None):
@@ -287,8 +269,10 @@ def bag_of(path, spots, messages, types=None):
 
 
 def pose_at(stamp, x):
-    place = {'position': [x, 0.0, -20.0], 'orientation': [0, 0, 0, 1.0], 'frame_id': 'odom'}
-    return write_navigation(Navigation(stamp_ns=stamp, **place), ros_message)
+    pose = Navigation(
+        stamp_ns=stamp, position=[x, 0.0, -20.0], orientation=[0, 0, 0, 1.0], frame_id='odom'
+    )
+    return write_navigation(pose, ros_message)
 
 
 def images_bag(path, spots):
@@ -331,21 +315,15 @@ def phases_bag(path, spots):
     bag_of(path, spots, messages)
 
 
-def cloud_bag(path, spots):
-    types, package = marine.typestore(), 'sensor_msgs/msg'
-    text = 'std_msgs/Header header\ngeometry_msgs/Point32[] points\n'
-    text += 'sensor_msgs/ChannelFloat32[] channels'
-    known = {'ChannelFloat32': 'string name\nfloat32[] values', 'PointCloud': text}
-    for name, fields in known.items():
-        if f'{package}/{name}' not in types.types:
-            types.register(get_types_from_msg(fields, f'{package}/{name}'))
-    point, cloud = types.types['geometry_msgs/msg/Point32'], types.types[f'{package}/PointCloud']
+POINT, CLOUD = 'geometry_msgs/msg/Point32', 'sensor_msgs/msg/PointCloud'
 
+
+def cloud_bag(path, spots):
     def messages(each, stamp):
         yield '/auv/odometry', pose_at(stamp, 0.5 * each.seconds)
-        seen = [point(x=60.0 - 0.5 * each.seconds, y=0.0, z=0.0)]
+        seen = [marine.make(POINT, x=60.0 - 0.5 * each.seconds, y=0.0, z=0.0)]
         header = marine.header(sec=stamp // 10**9)
-        yield '/micron/points', cloud(header=header, points=seen, channels=[])
+        yield '/micron/points', marine.make(CLOUD, header=header, points=seen, channels=[])
 
     bag_of(path, spots, messages)
 
@@ -357,14 +335,14 @@ def side_scan_xtf(path, spots):
         (each.seconds, place if np.allclose(each.degrees, place, atol=0.01) else each.degrees)
         for each, (_, place) in zip(spots, line_east(len(spots), 0.1))
     ]
-    side_scan(path, spots=towed)
+    sonar_files.side_scan(path, spots=towed)
 
 
 def soundings_xtf(path, spots):
     pytest.importorskip('pyxtf')
     beams = [(0.0, y, 20.0) for y in (-10.0, 0.0, 10.0)]
-    parts = [xtf_head([('port', 'port', 'uint16')]).to_bytes()]
-    parts += [xtf_soundings(each.seconds, beams, each.degrees) for each in spots]
+    parts = [sonar_files.xtf_head([('port', 'port', 'uint16')]).to_bytes()]
+    parts += [sonar_files.xtf_soundings(each.seconds, beams, each.degrees) for each in spots]
     path.write_bytes(b''.join(parts))
 
 
