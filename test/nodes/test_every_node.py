@@ -21,6 +21,8 @@ from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.trackers import SYSTEMS
 
 MESSAGES = 60
+MORE = ('obstacle', 'late'), ('fathometer', 'small'), ('fathometer', 'pressure')
+"""Messages that come late, cross-spectra, pressure."""
 
 
 class Fed(Driven):
@@ -65,7 +67,7 @@ class Fed(Driven):
         return [bytes(write_estimate(estimate, make).data) for estimate in made]
 
 
-@pytest.mark.parametrize('name, scenario', [*SMALL.items(), ('obstacle', 'late')])
+@pytest.mark.parametrize('name, scenario', [*SMALL.items(), *MORE])
 def test_live_is_offline_hostile_input_is_refused_and_services_answer(make_bench, name, scenario):
     """One start of the node, since starting takes longest."""
     driven = Fed(make_bench(), SYSTEMS[name], scenario)
