@@ -78,17 +78,15 @@ def messages(system, cases, first_seed=0):
 
 def parameters(system, draws):
     """Run `draws` extreme configurations."""
-    failures, start, ran, estimates = [], process_time(), 0, 0
+    failures, start, found = [], process_time(), []
     for number in range(draws):
         try:
-            found = run_extreme(system, number)
+            found.append(run_extreme(system, number))
         except Exception as error:
             failures.append(_text_of(error))
-            continue
-        ran += found is not None
-        estimates += found or 0
+    ran = [estimates for estimates in found if estimates is not None]
     return {
-        'draws': draws, 'ran': ran, 'estimates': estimates, 'failures': failures,
+        'draws': draws, 'ran': len(ran), 'estimates': sum(ran), 'failures': failures,
         'cpu_seconds': round(process_time() - start, 1),
     }  # fmt: skip
 
@@ -118,33 +116,28 @@ def main():
             system: pool.submit(_all, system, given.cases, given.draws) for system in given.systems
         }
         files = [pool.submit(file_results, name, given.files) for name in FILES if given.files]
-        shares = [
-            (name, min(AT_ONCE, given.states - first), first)
-            for first in range(0, given.states, AT_ONCE)
-            for name in RECORDED
-        ]
-        files += [pool.submit(state_results, *share) for share in shares]
+        for first in range(0, given.states, AT_ONCE):
+            count = min(AT_ONCE, given.states - first)
+            files += [pool.submit(state_results, name, count, first) for name in RECORDED]
         results = {system: item.result() for system, item in coming.items()}
         damaged = [item.result() for item in files]
-    failed = False
+    failures = []
     for system, result in results.items():
         hostile, extreme = result['messages'], result['parameters']
-        failed = failed or bool(hostile['failures'] or extreme['failures'])
         print(
             f'{system}: {hostile["cases"]} messages, {hostile["read"]} read, '
             f'{hostile["estimates"]} estimates, {len(hostile["failures"])} failures, slowest '
             f'{hostile["ms_most"]} ms; {extreme["ran"]} configurations, '
             f'{len(extreme["failures"])} failures'
         )
-        for failure in hostile['failures'] + extreme['failures']:
-            print(failure)
+        failures += hostile['failures'] + extreme['failures']
     for tried in damaged:
-        failed = failed or bool(tried['failures'])
         print('{name}: {draws} damaged, {used} used, {cpu_seconds} s'.format(**tried))
-        print(*tried['failures'], sep='\n', end='\n' * bool(tried['failures']))
+        failures += tried['failures']
+    print(*failures, sep='\n', end='\n' * bool(failures))
     if given.json:
         given.json.write_text(json.dumps(results, indent=1) + '\n')
-    return int(failed)
+    return int(bool(failures))
 
 
 if __name__ == '__main__':

@@ -118,7 +118,6 @@ def states_damaged(recording, draws, first=0):
     """Read states of a run, damaged in `draws` ways, and go on from those that are taken: how many
     were, and what was wrong. What a tracker raises then the node takes for a damaged state."""
     run = tracked(recording)
-    system = run.system.name
     taken, failures = 0, []
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / 'state'
@@ -132,46 +131,45 @@ def states_damaged(recording, draws, first=0):
                 forge(path, *forged(text, arrays, rng))
             else:
                 path.write_bytes(damaged(good, rng))
-            start = process_time()
+            start, problem = process_time(), ''
             try:
                 tracker = tracker_from(read_state(path), run.system, run.config)
                 taken += 1
                 if not k % 4 and path.read_bytes() != good:
-                    failures.append(f'state of {system}, draw {k}: damaged, and taken for good')
+                    problem = 'damaged, and taken for good'
                 with contextlib.suppress(Exception):
                     for measurement in run.input[CUT : CUT + GOES_ON]:
                         tracker.process(measurement)
             except StateError as error:
                 if '\n' in str(error) or len(str(error)) > MOST_WORDS:
-                    failures.append(f'state of {system}, draw {k}: {str(error)[:100]!r}')
+                    problem = repr(str(error)[:100])
             except Exception as error:
-                failures.append(f'state of {system}, draw {k}: {type(error).__name__}: {error}')
+                problem = f'{type(error).__name__}: {error}'
             if process_time() - start > LONGEST:
-                failures.append(f'state of {system}, draw {k}: {process_time() - start:.0f} s')
+                problem = f'{process_time() - start:.0f} s'
+            if problem:
+                failures.append(f'state of {run.system.name}, draw {k}: {problem}')
     return taken, failures
 
 
-FILES = {each.name: (convert_damaged, each) for each in FORMATS if each.kind != 'none'}
+FILES = {each.name: each for each in FORMATS if each.kind != 'none'}
 """What is damaged: each format that is taken in."""
 
 
 def file_results(name, draws):
     """What happened to `draws` damaged files, as plain values."""
-    attempt, what = FILES[name]
-    start = process_time()
-    return _results(name, draws, start, *attempt(what, draws))
+    return _results(name, draws, convert_damaged, FILES[name], draws)
 
 
 def state_results(recording, draws, first):
     """What happened to `draws` states of a run, from the number `first` on."""
-    start = process_time()
     name = f'state of {recording.split("_")[0]}'
-    return _results(name, draws, start, *states_damaged(recording, draws, first))
+    return _results(name, draws, states_damaged, recording, draws, first)
 
 
-def _results(name, draws, start, used, failures):
+def _results(name, draws, attempt, *what):
+    start = process_time()
+    used, failures = attempt(*what)
     seconds = round(process_time() - start, 1)
-    return {
-        'name': name, 'draws': draws, 'used': used, 'failures': failures[:5],
-        'cpu_seconds': seconds,
-    }  # fmt: skip
+    told = {'name': name, 'draws': draws, 'used': used, 'failures': failures[:5]}
+    return {**told, 'cpu_seconds': seconds}

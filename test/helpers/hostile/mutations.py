@@ -6,17 +6,113 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What is done to good messages. Each mutation takes a message, which it may change, and a
-generator of random numbers; most leave a message that gets past the first checks."""
+"""Messages as trees of plain values by the definitions of their types, and what is done to them.
+
+Adapters read by attribute access only, so that a tree serves as a message. A mutation takes a
+message, which it may change, and a generator of random numbers; most leave one that gets past the
+first checks. Every leaf keeps to its type: what no wire could bring is not tried.
+"""
 
 from __future__ import annotations
 
+from functools import cache
+from types import SimpleNamespace
+
 import numpy as np
+from rosbags.interfaces import Nodetype
 
 from msg_adapters.table import DATATYPES
 
-from .schema import clone, is_bool, is_many, is_sequence, leaves, make, number_type
-from .streams import SECOND
+from .. import marine
+
+SECOND = 10**9
+NUMBERS = {
+    'bool': 'u1', 'byte': 'u1', 'char': 'u1', 'octet': 'u1',
+    'int8': 'i1', 'uint8': 'u1', 'int16': 'i2', 'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4',
+    'int64': 'i8', 'uint64': 'u8', 'float32': 'f4', 'float64': 'f8',
+}  # fmt: skip
+"""The numpy type of each number on the wire."""
+
+
+@cache
+def definitions():
+    """The fields of every message type that an adapter reads: (name, node) by type."""
+    defined = marine.typestore().fielddefs
+    return {name: tuple(fields) for name, (_, fields) in defined.items()}
+
+
+def blank(type_name):
+    """A message of zeros."""
+    return SimpleNamespace(
+        **{name: _zero(node) for name, node in definitions()[type_name]}, __msgtype__=type_name
+    )
+
+
+def make(type_name, **values):
+    """A message with some fields; the factory that writers take."""
+    message = blank(type_name)
+    for name, value in values.items():
+        setattr(message, name, value)
+    return message
+
+
+def clone(value):
+    """A copy that shares nothing that can change."""
+    if isinstance(value, SimpleNamespace):
+        return SimpleNamespace(**{name: clone(member) for name, member in vars(value).items()})
+    if isinstance(value, list):
+        return [clone(item) for item in value]
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+def leaves(message):
+    """Every place that holds something: (owner, name, node), lists and arrays as one."""
+    for name, node in definitions()[message.__msgtype__]:
+        kind, detail = node
+        if kind == Nodetype.NAME:
+            yield from leaves(getattr(message, name))
+            continue
+        yield message, name, node
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and detail[0][0] == Nodetype.NAME:
+            for item in getattr(message, name)[:3]:
+                yield from leaves(item)
+
+
+def number_type(node):
+    """The numpy type of a leaf or of its elements; None for text and for messages."""
+    kind, detail = node
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return number_type(detail[0])
+    return np.dtype(NUMBERS[detail[0]]) if kind == Nodetype.BASE and detail[0] in NUMBERS else None
+
+
+def is_many(node):
+    return node[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+
+
+def is_sequence(node):
+    return node[0] == Nodetype.SEQUENCE
+
+
+def is_bool(node):
+    return node[0] == Nodetype.BASE and node[1][0] == 'bool'
+
+
+def _zero(node):
+    kind, detail = node
+    if kind == Nodetype.NAME:
+        return blank(detail)
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        inner, count = detail
+        length = count if kind == Nodetype.ARRAY else 0
+        number = number_type(inner)
+        if number is not None:
+            return np.zeros(length, number)
+        return [_zero(inner) for _ in range(length)]
+    if detail[0] in NUMBERS:
+        return False if detail[0] == 'bool' else np.zeros((), NUMBERS[detail[0]]).item()
+    return ''
+
 
 ODD = np.array([
     np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 1.0, 5e-324, 1e-45, 1e-30, 1e-12, 1e-6, 0.5, 3.0,

@@ -19,10 +19,9 @@ from rosbags.interfaces import Nodetype
 from msg_adapters.inputs import inputs_of, made_inputs
 from sonar_imm import measurements as m
 
-from .schema import blank, clone, is_many, leaves, make, number_type
+from .mutations import blank, clone, is_many, leaves, make, number_type, SECOND
 
 T0 = 1_700_000_000 * 10**9
-SECOND = 10**9
 STEPS = 12
 
 VARIANTS = {
