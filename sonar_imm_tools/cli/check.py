@@ -21,7 +21,8 @@ import click
 
 from sonar_imm.trackers import SYSTEMS
 
-from .common import BAG, example, json_option, params_option, print_json, say, warn
+from . import options as opt
+from .common import print_json, say, warn
 
 if TYPE_CHECKING:
     from .checking import CheckedRecording, PlayedRecording
@@ -29,17 +30,17 @@ if TYPE_CHECKING:
 
 # fmt: off
 @click.command(
-    epilog=example('sonar-imm check diver', 'sonar-imm check diver --bag dive.bag --limit 3'))
-@click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
-@click.option('--bag', type=BAG, help='Play this recording instead of the shipped ones.')
-@params_option('Parameter file for the node and the offline run.')
-@click.option('--limit', type=click.FloatRange(min=0.0), metavar='ERROR',
+    epilog=opt.example('sonar-imm check diver', 'sonar-imm check diver --bag dive.bag --limit 3'))
+@opt.systems
+@click.option('--bag', type=opt.PATH, help='Play this recording instead of the shipped ones.')
+@opt.params(help='Parameter file for the node and the offline run.')
+@click.option('--limit', type=opt.NOT_NEGATIVE, metavar='ERROR',
     help='Largest error allowed, of the kind and in the unit that the check prints, e.g. position '
     'RMSE in metres for the diver. By default that of the recording (check.yaml in its folder), '
     'or else of the system.')
-@click.option('--out', type=click.Path(path_type=Path, file_okay=False),
+@click.option('--out', type=opt.FOLDER,
     help='Keep both runs in this folder.')
-@json_option
+@opt.json
 def command(
     systems: tuple[str, ...], bag: Path | None, params: Path | None, limit: float | None,
     out: Path | None, as_json: bool,

@@ -6,13 +6,12 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What several subcommands share: ``--set``, ``--params``, JSON and progress."""
+"""What several subcommands share: parameters, JSON and progress."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
-import functools
 import json
 from pathlib import Path
 import sys
@@ -23,7 +22,6 @@ from typing import Any
 import click
 
 from msg_adapters.inputs import FEEDERS
-from sonar_imm.gone import GONE
 from sonar_imm.node_config import chosen_types, DetectorNodeConfig, node_config_type, NodeConfig
 from sonar_imm.parameters import (
     Config,
@@ -35,82 +33,15 @@ from sonar_imm.parameters import (
     unknown_parameters,
 )
 from sonar_imm.texts import visible
-from sonar_imm.trackers import System, SYSTEMS
+from sonar_imm.trackers import System
 
 from ..recordings.own_files import OF_FRAMES, OwnParameters, write_ros_parameters
 
 Advance = Callable[[int], None]
 
-BAG = click.Path(path_type=Path)
 SECONDS_BETWEEN_LINES = 5.0
 OF_EVERY_NODE = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 """Parameters that `ros2 param dump` writes of every node, and no tracker needs."""
-
-
-def example(*lines: str) -> str:
-    """The epilog of a help page: example command lines, kept as they are."""
-    return '\b\nExample:\n' + '\n'.join(f'  {line}' for line in lines)
-
-
-def _coordinates(
-    _ctx: click.Context, _param: click.Parameter, value: str
-) -> tuple[float, float, float]:
-    try:
-        numbers = tuple(float(part) for part in value.split(','))
-    except ValueError:
-        numbers = ()
-    if len(numbers) not in (2, 3):
-        raise click.BadParameter(f"'{value}' is not of the form X,Y or X,Y,Z")
-    x, y, z = (*numbers, 0.0)[:3]
-    return x, y, z
-
-
-def params_option(help: str) -> Callable[..., Any]:
-    """``--params FILE``."""
-    return click.option('--params', type=click.Path(path_type=Path, dir_okay=False), help=help)
-
-
-def timeout_option(default: float, *, when: str = '') -> Callable[..., Any]:
-    """``--timeout SECONDS``, of a command that listens to nodes."""
-    ends = 'with 1 when nothing is heard for so long from the start.'
-    return click.option('--timeout', type=click.FloatRange(min=0.0, min_open=True),
-        default=default, show_default=True, metavar='SECONDS',
-        help=f'{when}: end {ends}' if when else f'End {ends}')  # fmt: skip
-
-
-def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
-    """An option of the form NAME=VALUE that may be repeated; the command gets a dict."""
-
-    def split(
-        _ctx: click.Context, _param: click.Parameter, values: Iterable[str]
-    ) -> dict[str, str]:
-        pairs = {}
-        for value in values:
-            name, equals, text = value.partition('=')
-            if not equals or not name.strip():
-                raise click.BadParameter(f"'{value}' is not of the form {metavar}")
-            pairs[name.strip()] = text.strip()
-        return pairs
-
-    return click.option(*names, metavar=metavar, multiple=True, callback=split, help=help)
-
-
-# Options of several commands.
-# fmt: off
-json_option = click.option('--json', 'as_json', is_flag=True, help='Print the result as JSON.')
-set_option = pairs_option('--set', 'overrides', metavar='NAME=VALUE',
-    help='Change one parameter; may be given several times.')
-topic_option = pairs_option('--topic', 'topics', metavar='INPUT=TOPIC',
-    help='Topic of an input, e.g. fix=/usbl/pose; may be given several times.')
-system_option = click.option('--system', type=click.Choice(list(SYSTEMS)), default=None,
-    help='Which tracker; by default the one whose inputs are in the bag.')
-crs_option = click.option('--crs', '--epsg', 'epsg', type=click.IntRange(min=1),
-    help='Coordinate system, by its EPSG number.')
-origin_option = click.option('--origin', default='0,0', callback=_coordinates, metavar='X,Y[,Z]',
-    help='Coordinates in that system of the origin of the navigation.')
-jobs_option = functools.partial(click.option, '--jobs', type=click.IntRange(min=1), default=1,
-    show_default=True)
-# fmt: on
 
 
 def typed_overrides(config_type: type[Config], overrides: dict[str, str]) -> dict[str, Any]:
@@ -271,17 +202,6 @@ def _parameters_of(
     return {key: value for key, value in values.items() if key.split('.')[0] not in OF_EVERY_NODE}
 
 
-class Renewed(click.Command):
-    """A command that says what took the place of its removed options."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        for word in args:
-            option = word.partition('=')[0]
-            if gone := GONE.get(f'option {ctx.info_name} {option}'):
-                ctx.fail(f"'{option}' {gone}")
-        return super().parse_args(ctx, args)
-
-
 def print_json(result: Any) -> None:
     """Print `result` as JSON; NaN and infinity, which JSON lacks, become null."""
     from ..offline.run_folder import finite
@@ -322,18 +242,14 @@ def progress(
             task = bar.add_task(first or what, total=total)
             yield lambda count: bar.update(task, advance=count, description=what)
     else:
-        yield _plain_progress(what, total)
+        # A line every few seconds, so that the log of a short job stays empty.
+        done, printed = 0, time.monotonic()
 
+        def advance(count: int) -> None:
+            nonlocal done, printed
+            done += count
+            if time.monotonic() - printed > SECONDS_BETWEEN_LINES:
+                printed = time.monotonic()
+                warn(f'{what}: {done} of {total}')
 
-def _plain_progress(what: str, total: int) -> Advance:
-    """A line every few seconds, so that the log of a short job stays empty."""
-    done, printed = 0, time.monotonic()
-
-    def advance(count: int) -> None:
-        nonlocal done, printed
-        done += count
-        if time.monotonic() - printed > SECONDS_BETWEEN_LINES:
-            printed = time.monotonic()
-            warn(f'{what}: {done} of {total}')
-
-    return advance
+        yield advance

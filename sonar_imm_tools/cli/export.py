@@ -18,7 +18,8 @@ import click
 
 from sonar_imm.files import whole
 
-from .common import crs_option, example, json_option, origin_option, print_json, say
+from . import options as opt
+from .common import print_json, say
 
 FORMATS = ('xyz', 'las', 'laz', 'tif')
 HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
@@ -27,24 +28,24 @@ TRACK_FORMATS = ('gpx', 'kml', 'geojson', 'csv', 'parquet')
 
 # fmt: off
 @click.command(
-    epilog=example('sonar-imm export out survey.laz --epsg 32632 --origin 500000,6000000',
+    epilog=opt.example('sonar-imm export out survey.laz --epsg 32632 --origin 500000,6000000',
         'sonar-imm export out survey.tif --cell 0.5 --epsg 32632 --origin 500000,6000000',
         'sonar-imm export out survey.csv', 'sonar-imm export out horizons.csv --epsg 32615',
         'sonar-imm export out picks.sgy --segy line.seg', 'sonar-imm export out tracks.gpx',
         'sonar-imm export out tracks.geojson --epsg 32632 --origin 500000,6000000',
         'sonar-imm export out map.geojson --map --epsg 32632 --origin 500000,6000000'))
-@click.argument('run', type=click.Path(path_type=Path, file_okay=False))
-@click.argument('out', type=click.Path(path_type=Path, dir_okay=False))
-@crs_option
-@origin_option
-@click.option('--cell', type=click.FloatRange(min=0.0, min_open=True), default=1.0,
+@click.argument('run', type=opt.FOLDER)
+@click.argument('out', type=opt.FILE)
+@opt.crs
+@opt.origin
+@click.option('--cell', type=opt.POSITIVE, default=1.0,
     show_default=True, help='Side of the cells of a grid, in metres.')
 @click.option('--segy', 'original', type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help='horizons: the SEG-Y file that the recording was converted from.')
 @click.option('--map', 'as_map', is_flag=True,
     help='obstacles: .geojson with those that are known at the end, in place of their tracks.')
 @click.option('--overwrite', is_flag=True, help='Replace OUT.')
-@json_option
+@opt.json
 def command(
     run: Path, out: Path, epsg: int | None, origin: tuple[float, float, float], cell: float,
     original: Path | None, as_map: bool, overwrite: bool, as_json: bool,

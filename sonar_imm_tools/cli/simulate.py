@@ -20,7 +20,8 @@ from msg_adapters.inputs import FEEDERS
 from sonar_imm import __version__
 from sonar_imm.trackers import SYSTEMS
 
-from .common import by_topic, example, json_option, print_json, say, set_option, typed_overrides
+from . import options as opt
+from .common import by_topic, print_json, say, typed_overrides
 
 SURVEY, SURVEY_SCENES = 'survey', 'sonar_imm_tools.simulation.survey'
 """Not a system: lines of soundings over one floor."""
@@ -28,21 +29,21 @@ SURVEY, SURVEY_SCENES = 'survey', 'sonar_imm_tools.simulation.survey'
 
 # fmt: off
 @click.command(
-    epilog=example('sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
+    epilog=opt.example('sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
         'sonar-imm simulate diver --list',
         'sonar-imm simulate survey out --soundings --set lines=5'))
 @click.argument('system', type=click.Choice([*SYSTEMS, SURVEY]))
-@click.argument('out_bag', type=click.Path(path_type=Path), required=False)
+@click.argument('out_bag', type=opt.PATH, required=False)
 @click.option('--scenario', default=None, help='Name of the scene; by default the first one.')
 @click.option('--seed', type=click.IntRange(min=0), default=0, show_default=True,
     help='The same scenario and seed give the same bag.')
-@set_option
+@opt.overrides
 @click.option('--soundings', is_flag=True,
     help='survey: folders of soundings, as `survey` reads them.')
 @click.option('--compress', is_flag=True, help='Compress the bag: pressure takes a third.')
 @click.option('--list', 'list_scenarios', is_flag=True,
     help='Only list scenarios and what --set can change.')
-@json_option
+@opt.json
 def command(
     system: str, out_bag: Path | None, scenario: str | None, seed: int, overrides: dict[str, str],
     soundings: bool, compress: bool, list_scenarios: bool, as_json: bool,

@@ -163,8 +163,6 @@ class Check:
     good: bool
 
 
-# -- in words ------------------------------------------------------------------------------------
-
 NO_TRUTH = (
     'There is no truth to compare with, so only the estimates and their stated uncertainty are '
     'shown.'

@@ -109,13 +109,18 @@ def _look_at(item: BagMessage, found: _Found, detector: Mapping[str, Any]) -> No
             found.stamps.append(stamp)
         else:
             found.no_stamp += 1
-    for system, entry in _readers(item):
+    for system, entry in [] if is_truth(item.topic) else _readers(item):
         try:
             settings = detector if entry.makes else {}
             made = entry.reader(item.type_name, 'enu', settings)(item.message)
             found.good[system, entry.name] += 1
             if isinstance(made, (Fix, GeodeticFix)) and len(found.fixes) < MOST_FIXES:
-                found.fixes.append((made.stamp_ns, *_place(made)))
+                if isinstance(made, Fix):
+                    place = made.position[:2].tolist()
+                else:  # metres east and north nearly
+                    place = [111e3 * made.longitude * np.cos(np.radians(made.latitude))]
+                    place.append(111e3 * made.latitude)
+                found.fixes.append((made.stamp_ns, *place))
             if (code := entry.doubt(item.message, made)) is not None:
                 found.doubts[code] += 1
         except Rejection as rejection:
@@ -127,9 +132,7 @@ def _look_at(item: BagMessage, found: _Found, detector: Mapping[str, Any]) -> No
 
 
 def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
-    """The tracker inputs that a message could be for. Truth is no input."""
-    if is_truth(item.topic):
-        return []
+    """The tracker inputs that a message could be for."""
     found = []
     for system in SYSTEMS:
         fitting = [
@@ -143,25 +146,20 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
 
 def _topic_entry(found: _Found) -> dict[str, Any]:
     span = (found.logs[-1] - found.logs[0]) / SECOND if found.logs else 0.0
-    suits = [f'{system} {name}' for system, name in found.good]
+    scans = None  # of a topic of scans: how many stamps, and the most messages that share one
+    if found.stamps and _holds_scans(found):
+        counts = np.unique(np.array(found.stamps, np.int64), return_counts=True)[1]
+        scans = {'count': len(counts), 'most': int(counts.max())}
     return {
         'name': found.topic.name,
         'type': found.topic.type_name,
         'count': found.topic.count,
         'rate_hz': (len(found.logs) - 1) / span if span > 0 else None,
         'frames': list(found.frames),
-        'suits': suits,
-        'scans': _scans(found),
+        'suits': [f'{system} {name}' for system, name in found.good],
+        'scans': scans,
         'problems': _stamp_problems(found) + _content_problems(found) + _scan_hint(found),
     }
-
-
-def _place(fix: Fix | GeodeticFix) -> tuple[float, float]:
-    """Metres east and north, of latitudes nearly."""
-    if isinstance(fix, Fix):
-        return float(fix.position[0]), float(fix.position[1])
-    degree = 111e3
-    return degree * fix.longitude * float(np.cos(np.radians(fix.latitude))), degree * fix.latitude
 
 
 def _scan_hint(found: _Found) -> list[str]:
@@ -184,14 +182,6 @@ def _scan_hint(found: _Found) -> list[str]:
         f'every fix has a stamp of its own, and each diver comes again after {period:.3g} s: '
         f'where the sensor rotates or polls, --set scan_period={period:.3g} makes scans of them'
     ]
-
-
-def _scans(found: _Found) -> dict[str, int] | None:
-    """Number of stamps of a topic of scans, and the most messages that share one; else None."""
-    if not found.stamps or not _holds_scans(found):
-        return None
-    counts = np.unique(np.array(found.stamps, np.int64), return_counts=True)[1]
-    return {'count': len(counts), 'most': int(counts.max())}
 
 
 def _holds_scans(found: _Found) -> bool:

@@ -366,8 +366,8 @@ class RunFolder:
         the one called `but`, or of a file of its recording."""
         place = Path(os.path.realpath(out))
         here = Path(os.path.realpath(self.path))
-        own = [Path(os.path.realpath(here / name)) for name in (*_RUN_FILES, MARKER)]
-        own += [here / name for name in (*_RUN_FILES, MARKER)]
+        named = [here / name for name in (*_RUN_FILES, MARKER)]
+        own = [*named, *(Path(os.path.realpath(name)) for name in named)]
         if place != here / but and any(place.is_relative_to(item) for item in own):
             raise BagError(f'{out} is a file of the run {self.path}; choose another name')
         bag = self.read_run()['bag']

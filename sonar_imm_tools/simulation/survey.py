@@ -31,11 +31,12 @@ from sonar_imm.acoustics.geometry import rotation
 from sonar_imm.acoustics.sounding import ErrorBudget, uncertainties
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.parameters import parameter
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm.truth import Received, Scene
 
 from ..recordings.export.points import Points
 from .bathymetry.ship import navigation_of, Ship, ship_of, Terrain, Waves
-from .bathymetry.simulator import BathymetryScenario, hear, profile_below
+from .bathymetry.simulator import BathymetryScenario, floor_below, hear, look_of
 from .scenario import FIRST_STAMP_NS, lasting, Scenario, Scenarios
 
 TERRAINS = ('survey', 'flat', 'slope')
@@ -240,9 +241,8 @@ def _swaths(
     """Pings and navigation of a line."""
     ship = ship_of(sonar, sonar.sonar_depth, rng)
     ship = ship._replace(start=ship.start + [*start, 0.0])
-    ground = _Ground(
-        -KEEL - sonar.sonar_height, ship.course, floor.at, lambda along, off: off > np.inf
-    )
+    level = -KEEL - sonar.sonar_height
+    ground = _Ground(level, ship.course, floor.at, lambda along, off: off > np.inf)
     count = round((sonar.last_range - sonar.first_range) / sonar.bin_width)
     ranges = sonar.first_range + sonar.bin_width * np.arange(count, dtype=np.float64)
     heard = round(2e9 * ranges[-1] / SOUND_SPEED)
@@ -250,14 +250,13 @@ def _swaths(
     for ping in range(sonar.pings):
         sent = ping / sonar.ping_rate
         for side in ('port', 'starboard'):
-            profile = profile_below(
-                sonar, ship, ground, np.zeros(count), first_ns, sent, ranges, side, side
-            )
+            look = look_of(sonar, ship, sent, ranges, side)
+            profile = floor_below(sonar, look, ground, np.zeros(count), ranges)
+            profile = evolve(profile, stamp_ns=first_ns + round(sent * 1e9), namespace=side)
             truth.append(profile)
             received.append(Received(profile.stamp_ns + heard, hear(sonar, profile, rng), side))
-    stated = navigation_of(
-        sonar, _as_reported(ship, correction), first_ns, sonar.pings / sonar.ping_rate, rng, 'map'
-    )
+    reported, seconds = _as_reported(ship, correction), sonar.pings / sonar.ping_rate
+    stated = navigation_of(sonar, reported, first_ns, seconds, rng, 'map')
     received += [Received(each.stamp_ns, each) for each in stated]
     received.sort(key=lambda item: item.received_ns)
     return Scene(tuple(received), tuple(truth), frame_id='map')
@@ -298,13 +297,7 @@ def write_truth(path: Path, scene: SurveyScene) -> None:
 
 def budget() -> ErrorBudget:
     """The errors that a tracker supposes by default, and that the scene has."""
-    return ErrorBudget(
-        attitude=math.radians(0.05),
-        heading=math.radians(0.1),
-        heave=0.05,
-        position=0.1,
-        sound_speed=0.5,
-    )
+    return BathymetryConfig().budget()
 
 
 def _floor(config: SurveyScenario, width: float, rng: Generator) -> Floor:

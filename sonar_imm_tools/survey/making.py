@@ -69,9 +69,6 @@ LEAST_SOUNDINGS = 5.0
 STATISTICS_CELL = 2.0
 
 
-# -- which lines there are -----------------------------------------------------------------------
-
-
 def sources_of(runs: Path) -> list[Source]:
     """The lines below a folder, sorted by name: folders with a table of soundings, and recordings
     of `~/soundings` that are not of such a folder. Raises `BagError` for none."""
@@ -80,7 +77,11 @@ def sources_of(runs: Path) -> list[Source]:
     found: dict[Path, Path] = {}
     for name in (SOUNDINGS, PARQUET[SOUNDINGS]):  # the later one is read
         found |= {path.parent: path for path in sorted(runs.rglob(name)) if WORK not in path.parts}
-    for place in _recordings(runs):
+    # Bags, and files of bags that lie alone.
+    bags = {path.parent for path in runs.rglob('metadata.yaml')}
+    files = (path for path in runs.rglob('*') if is_recording(path) and path.is_file())
+    alone = {path for path in files if path.parent not in bags}
+    for place in sorted(path for path in bags | alone if WORK not in path.parts):
         # The bag of a run whose table is gone stands for it.
         bag = place if place.is_dir() else place.parent
         folder = bag.parent if bag.name == BAG and _is_results(bag.parent) else place
@@ -101,14 +102,6 @@ def sources_of(runs: Path) -> list[Source]:
         run, failure = _run_of(folder)
         sources.append(Source(name=name, folder=folder, table=table, run=run, failure=failure))
     return sorted(sources, key=lambda source: source.name)
-
-
-def _recordings(runs: Path) -> list[Path]:
-    """Bags below a folder, and files of bags that lie alone."""
-    bags = {path.parent for path in runs.rglob('metadata.yaml')}
-    files = (path for path in runs.rglob('*') if is_recording(path) and path.is_file())
-    alone = {path for path in files if path.parent not in bags}
-    return sorted(path for path in bags | alone if WORK not in path.parts)
 
 
 def _has_soundings(recording: Path) -> bool:
@@ -166,9 +159,6 @@ def frame_of(sources: Sequence[Source]) -> tuple[float, float, float] | None:
             if (first := origin_of(source.run, source.name)) is not None:
                 return first.latitude, first.longitude, first.height
     return None
-
-
-# -- which tiles there are ----------------------------------------------------------------------
 
 
 @frozen(eq=False)
@@ -242,9 +232,6 @@ def extent_of(tiles: Sequence[Tile]) -> tuple[float, float, float, int, int]:
     return low[0], high[1], cell, rows, columns
 
 
-# -- the survey ----------------------------------------------------------------------------------
-
-
 @frozen(kw_only=True)
 class Progress:
     """What hears of stages: `begin(what, total)` gives what hears of each that is done."""
@@ -286,7 +273,14 @@ def make(
     """Do all jobs; out: the folder of the survey, whose ``.work`` they fill. Raises `BagError`."""
     work = out / WORK
     units, lines, budget = _imported(sources, work, options, run, progress)
-    warnings = [*_unstated(sources, lines), *_far(lines)]
+    warnings = _unstated(sources, lines)
+    for line in lines:
+        if far := line['far']:
+            says = 'lies far away and is' if far == 1 else 'lie far away and are'
+            warnings.append(
+                f'{line["name"]}: {counted(far, "sounding")} {says} left out: no ship that sees '
+                'the others can have seen them'
+            )
     depth = float(np.median([unit.depth for unit in units]))
     coarse = options.resolution or 2.0 ** math.floor(math.log2(max(0.05 * depth, FINEST)))
     cell = max(STATISTICS_CELL, 2.0 * min(coarse, COARSEST))
@@ -307,18 +301,15 @@ def make(
     )
     found: Adjustment | None = None
     after: Misties = {}
+
+    def tell(k: int, left: float) -> None:
+        progress.say(f'round {k}: misties {left:.3f} m rms')
+
     if options.adjusted:
         fixed = [unit.number for unit in units if unit.line in options.fixed]
         try:
-            found = adjust_lines(
-                statistics,
-                units,
-                budget,
-                fixed,
-                cell,
-                work / 'adjustment.npz',
-                lambda k, left: progress.say(f'round {k}: misties {left:.3f} m rms'),
-            )
+            place = work / 'adjustment.npz'
+            found = adjust_lines(statistics, units, budget, fixed, cell, place, tell)
         except ValueError as error:
             raise BagError(f'the lines cannot be adjusted: {error}') from None
         warnings += _warnings_of(found)
@@ -351,10 +342,8 @@ def make(
 def _imported(
     sources: Sequence[Source], work: Path, options: Options, run: Run, progress: Progress
 ) -> tuple[list[Unit], list[dict[str, Any]], ErrorBudget]:
-    places = [
-        work / 'lines' / hashlib.sha256(os.fsencode(source.name)).hexdigest()[:16]
-        for source in sources
-    ]
+    digests = [hashlib.sha256(os.fsencode(source.name)).hexdigest() for source in sources]
+    places = [work / 'lines' / digest[:16] for digest in digests]
     for folder in ('lines', 'looks', 'adjusted', 'soundings', 'tiles'):
         (work / folder).mkdir(parents=True, exist_ok=True)
     infos: list[dict[str, Any]] = [{} for _ in sources]
@@ -369,14 +358,9 @@ def _imported(
     for source, place, info, failure in zip(sources, places, infos, failures):
         if failure:
             progress.warn(f'left out: {source.name}: {failure}')
-        lines.append(
-            {
-                'name': source.name,
-                'folder': str(source.folder),
-                **{key: info.get(key) for key in _STATED},
-                'failure': failure,
-            }
-        )
+        stated = {key: info.get(key) for key in _STATED}
+        named = {'name': source.name, 'folder': str(source.folder)}
+        lines.append({**named, **stated, 'failure': failure})
         made_with = (kept(place.with_suffix('.json')) or {}).get('wanted')
         for piece in range(info.get('pieces', 0)):
             several = f'#{piece + 1}' if info['pieces'] > 1 else ''
@@ -396,9 +380,7 @@ def _imported(
         raise BagError(f'no line can be read; the first: {failures[0]}')
     if unknown := set(options.fixed) - {unit.line for unit in units}:
         raise BagError(f'there is no line {sorted(unknown)[0]} to fix')
-    widest = {
-        name: max(getattr(budget, name) for budget in budgets) for name in asdict(budgets[0])
-    }
+    widest = {name: max(getattr(each, name) for each in budgets) for name in asdict(budgets[0])}
     return units, lines, ErrorBudget(**widest)
 
 
@@ -459,12 +441,9 @@ def _tiled(
 
 def _neighbours(tiles: Sequence[Tile]) -> dict[str, list[str]]:
     """Of each tile the names of those that its nodes need, itself among them, in order."""
-    low = (
-        np.array([[tile.i, tile.j] for tile in tiles])
-        * TILE
-        * np.array([[tile.cell] for tile in tiles])
-    )
-    side = np.array([tile.cell * TILE for tile in tiles])[:, None]
+    cell = np.array([[tile.cell] for tile in tiles])
+    low = np.array([[tile.i, tile.j] for tile in tiles]) * TILE * cell
+    side = cell * TILE
     names = [tile.name for tile in tiles]
     found = {}
     for k, tile in enumerate(tiles):
@@ -486,19 +465,6 @@ def _unstated(sources: Sequence[Source], lines: Sequence[Mapping[str, Any]]) -> 
         named = ', '.join(names[:3]) + (', ...' if len(names) > 3 else '')
         kind = 'error budget' if what == RUN else 'values'
         found.append(f'{counted(len(names), "line")} without {what} ({named}): default {kind}')
-    return found
-
-
-def _far(lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return warnings that name the lines of which soundings are left out."""
-    found = []
-    for line in lines:
-        if far := line['far']:
-            says = 'lies far away and is' if far == 1 else 'lie far away and are'
-            found.append(
-                f'{line["name"]}: {counted(far, "sounding")} {says} left out: no ship that sees '
-                'the others can have seen them'
-            )
     return found
 
 

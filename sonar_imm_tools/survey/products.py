@@ -22,7 +22,6 @@ from typing import Any
 
 from attrs import asdict, fields
 import numpy as np
-import plotly.graph_objects as go
 import plotly.offline
 
 from sonar_imm import __version__
@@ -31,7 +30,7 @@ from sonar_imm.files import hindrance, mark, MARKER, remove_leftovers, replaced,
 from sonar_imm.parameters import ConfigError
 from sonar_imm.texts import visible
 
-from ..evaluation.plotting import add_points, COLOURS, styled
+from ..evaluation.plotting import COLOURS, Picture
 from ..evaluation.report import rendered
 from ..offline.run_folder import REPORT
 from ..recordings.csv_writer import CsvWriter
@@ -275,9 +274,6 @@ def _write_crossings(path: Path, survey: Survey) -> None:
             writer.write([names[pair[0]], names[pair[1]], cells, *row])
 
 
-# -- the page of a survey: chart, uncertainty, what competes, misties, what could not be told -----
-
-
 MOST_CELLS = 400
 """Cells along the longer side of a figure."""
 SUN = (math.radians(315.0), math.radians(45.0))
@@ -321,7 +317,7 @@ def write_report(out: Path, survey: Survey, chart: Chart, content: Mapping[str, 
         unfinished.write_bytes(f'{text}\n'.encode('utf-8', 'backslashreplace'))
 
 
-def hillshaded(chart: Chart, thin: int) -> go.Figure:
+def hillshaded(chart: Chart, thin: int) -> Picture:
     """Depths, darker where they turn from the light."""
     depth = chart.bands['depth'][::thin, ::thin]
     figure = _image(chart, chart.bands['depth'], thin, 'depth [m]', 'Viridis_r')
@@ -346,9 +342,9 @@ def hillshaded(chart: Chart, thin: int) -> go.Figure:
     return figure
 
 
-def misties_figure(survey: Survey) -> go.Figure:
+def misties_figure(survey: Survey) -> Picture:
     """Robust rms of each pair of lines, before and after."""
-    figure = go.Figure()
+    figure = Picture()
     pairs = sorted({*survey.before, *survey.after})
     for name, found, colour in (
         ('before', survey.before, COLOURS[1]),
@@ -357,13 +353,12 @@ def misties_figure(survey: Survey) -> go.Figure:
         there = [k for k, pair in enumerate(pairs) if pair in found]
         values = [found[pairs[k]].rms for k in there]
         if there:
-            add_points(figure, there, values, name, colour, 6)
-    return styled(
-        figure, 320, {'title': 'pair of lines'}, {'title': 'rms [m]', 'rangemode': 'tozero'}
-    )
+            figure.points(there, values, name, colour, 6)
+    rms = {'title': 'rms [m]', 'rangemode': 'tozero'}
+    return figure.styled(320, {'title': 'pair of lines'}, rms)
 
 
-def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str) -> go.Figure:
+def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str) -> Picture:
     x, y = chart.axes(thin)
     shown = values[::thin, ::thin].astype(np.float32)
     low, high = (-1.0, 1.0)
@@ -372,14 +367,14 @@ def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str
     if colours == 'RdBu':
         high = max(abs(low), abs(high))
         low = -high
-    figure = go.Figure()
+    figure = Picture()
     figure.add_heatmap(
         x=x, y=y, z=shown, colorscale=colours, zmin=low, zmax=high, colorbar={'title': title}
     )
     axis = {'zeroline': False, 'tickformat': 'd'}
     east = {'title': 'east [m]', 'constrain': 'domain', 'nticks': 5, **axis}
     north = {'title': 'north [m]', 'scaleanchor': 'x', **axis}
-    return styled(figure, 560, east, north)
+    return figure.styled(560, east, north)
 
 
 def _summary(survey: Survey, chart: Chart) -> str:

@@ -214,7 +214,8 @@ def match(series: Series, truth: Truth, *, cutoff: float) -> Matching:
     states = truth.at(series.scan_ns)
     present = np.isfinite(states[:, :, 0])
     known = present.any(axis=0)
-    limit = np.inf if _one_to_one(series, truth) else cutoff
+    one_to_one = len(truth) == 1 and len(np.unique(series.stamp_ns)) == len(series)
+    limit = np.inf if one_to_one else cutoff
     starts = np.searchsorted(series.stamp_ns, series.scan_ns, side='left')
     ends = np.searchsorted(series.stamp_ns, series.scan_ns, side='right')
     followed_by = np.full(present.shape, -1, np.int64)
@@ -262,10 +263,6 @@ def assign(distance: FloatArray, limit: float) -> list[tuple[int, int]]:
     ]
 
 
-def _one_to_one(series: Series, truth: Truth) -> bool:
-    return len(truth) == 1 and len(np.unique(series.stamp_ns)) == len(series)
-
-
 def track_summary(matching: Matching) -> dict[str, float]:
     """Counts that describe whole tracks.
 
@@ -275,26 +272,21 @@ def track_summary(matching: Matching) -> dict[str, float]:
     """
     series = matching.series
     found = matching.followed_by != -1
-    present = int(matching.present.sum())
+    wanted = int(matching.present.sum())
     scored_ids, lifetimes = np.unique(series.track_id[matching.scored], return_counts=True)
     on_target = series.track_id[matching.row]
     hits = np.array([np.count_nonzero(on_target == track_id) for track_id in scored_ids])
+    begins = [
+        np.diff(f[there].astype(np.int8), prepend=0) for f, there in zip(found, matching.present)
+    ]
     return {
         'true_targets': int(matching.present.any(axis=1).sum()),
         'tracks': len(scored_ids),
         'false_tracks': int(np.count_nonzero(2 * hits < lifetimes)),
         'identity_switches': identity_switches(matching.followed_by.T),
-        'fragmentations': sum(
-            _interruptions(is_found[there]) for is_found, there in zip(found, matching.present)
-        ),
-        'completeness': float(found.sum() / present) if present else float('nan'),
+        'fragmentations': sum(max(0, np.count_nonzero(each == 1) - 1) for each in begins),
+        'completeness': float(found.sum() / wanted) if wanted else float('nan'),
         'false_rows_per_scan': float(
             (matching.scored.sum() - len(matching.row)) / max(1, len(matching.scan_ns))
         ),
     }
-
-
-def _interruptions(found: NDArray[np.bool_]) -> int:
-    """How often a target that had been found was found again after a loss."""
-    begins = np.count_nonzero(np.diff(found.astype(np.int8), prepend=0) == 1)
-    return max(0, int(begins) - 1)

@@ -40,14 +40,9 @@ class FathometerScenario(Scenario):
     """Parameters of a fathometer scene; the defaults are like the drift of the paper."""
 
     INSTRUMENT = (
-        'record_seconds',
-        'snapshot_seconds',
-        'frequency_min',
-        'frequency_max',
-        'phones',
-        'element_spacing',
-        'sound_speed',
-    )
+        'record_seconds', 'snapshot_seconds', 'frequency_min', 'frequency_max', 'phones',
+        'element_spacing', 'sound_speed',
+    )  # fmt: skip
 
     # fmt: off
     level: str = parameter('response', '', 'kind of records that is written', choices=LEVELS)
@@ -147,9 +142,11 @@ class FathometerScenario(Scenario):
             problems.append('frequency_max cannot exceed half the sample_rate')
         if self.level == 'pressure' and self.records * self.record_seconds > 600.0:
             problems.append('pressure is made for 600 s at the most: fewer or shorter records')
-        if self.level == 'csdm' and self.spectra_bytes() > MOST_MEMORY:
+        rows = (self.frequency_max - self.frequency_min) * self.snapshot_seconds
+        size = 8.0 * self.records * rows * self.phones**2
+        if self.level == 'csdm' and size > MOST_MEMORY:
             problems.append(
-                f'these cross-spectra would take {1e-9 * self.spectra_bytes():.1f} GB: '
+                f'these cross-spectra would take {1e-9 * size:.1f} GB: '
                 'make fewer records, or traces of them (level response)'
             )
         if self.ship_pass and len(self.ship_pass) != 2:
@@ -174,11 +171,6 @@ class FathometerScenario(Scenario):
             known |= envelope_parameters(self.pulse_width, self.noise_sigma)
         # The speed of a scene is the one that it has.
         return {**known, 'sound_speed_std': 0.0}
-
-    def spectra_bytes(self) -> float:
-        """Size of all cross-spectra of the scene."""
-        rows = (self.frequency_max - self.frequency_min) * self.snapshot_seconds
-        return 8.0 * self.records * rows * self.phones**2
 
 
 # fmt: off
