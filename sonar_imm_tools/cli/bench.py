@@ -53,11 +53,8 @@ def command(
         results[system] = _measure(speed, system, rounds, quiet=as_json)
         if not skip_node:
             results[system]['node_ms'] = latency = _node_latency(system, bag)
-            say(
-                f'  live node, message to estimate: p50 {latency["p50"]:.2f} ms, '
-                f'p99 {latency["p99"]:.2f} ms',
-                quiet=as_json,
-            )
+            delays = f'p50 {latency["p50"]:.2f} ms, p99 {latency["p99"]:.2f} ms'
+            say(f'  live node, message to estimate: {delays}', quiet=as_json)
     if as_json:
         print_json(results)
     if strict and not all(

@@ -15,7 +15,7 @@ from concurrent.futures import as_completed
 import functools
 from pathlib import Path
 import tempfile
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import click
 
@@ -53,14 +53,8 @@ def command(
     if bag is not None and len(systems or SYSTEMS) > 1:
         raise click.UsageError('--bag needs exactly one system')
     with tempfile.TemporaryDirectory(prefix='sonar_imm_check_') as scratch:
-        recordings = run_checks(
-            systems or tuple(SYSTEMS),
-            out or Path(scratch),
-            bag=bag,
-            params=params,
-            limit=limit,
-            quiet=as_json,
-        )
+        asked: dict[str, Any] = {'bag': bag, 'params': params, 'limit': limit, 'quiet': as_json}
+        recordings = run_checks(systems or tuple(SYSTEMS), out or Path(scratch), **asked)
     if as_json:
         print_json([recording.as_dict() for recording in recordings])
     else:
@@ -148,12 +142,8 @@ def print_checks(recording: CheckedRecording) -> None:
     """Print the checks of one recording."""
     say(f'{recording.system}: {recording.bag.name}')
     for check in recording.checks:
-        say(
-            f'  {"ok  " if check.good else "FAIL"}  {check.name}: {check.result}'
-            f' (wanted: {check.wanted})'
-        )
-    if recording.latency_ms:
-        say(
-            f'        latency of an estimate: p50 {recording.latency_ms["p50"]:.1f} ms, '
-            f'p99 {recording.latency_ms["p99"]:.1f} ms'
-        )
+        state = 'ok  ' if check.good else 'FAIL'
+        say(f'  {state}  {check.name}: {check.result} (wanted: {check.wanted})')
+    if latency := recording.latency_ms:
+        delays = f'p50 {latency["p50"]:.1f} ms, p99 {latency["p99"]:.1f} ms'
+        say(f'        latency of an estimate: {delays}')

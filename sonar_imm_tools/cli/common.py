@@ -91,7 +91,7 @@ def load_config(
     tracker, node = system.config_type(), node_config_type(system)
     values = _parameters_of(params, system, system.name, report=True) if params else {}
     specs = {spec.name: spec for spec in node.specs()} | specs_with(tracker, values, overrides)
-    values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
+    values |= {name: _typed(text, specs.get(name)) for name, text in overrides.items()}
     others = _detector_specs(system)
     if unknown := [name for name in values if name not in specs and name not in others]:
         raise ConfigError(*unknown_parameters(unknown, specs))
@@ -119,9 +119,7 @@ def load_detector(
     # A file for the tracker's node alone says nothing of the detector.
     feeder = FEEDERS[system.name]
     values = _parameters_of(params, system, feeder, needed=False) if params else {}
-    values.update(
-        {name: _typed(text, specs[name]) for name, text in overrides.items() if name in specs}
-    )
+    values |= {k: _typed(text, specs[k]) for k, text in overrides.items() if k in specs}
     config = DetectorConfig.from_mapping(values, ignore_unknown=True)
     defaults = DetectorConfig().as_dict()
     return {k: value for k, value in config.as_dict().items() if value != defaults[k]}

@@ -46,8 +46,7 @@ class Convert(click.Group):
             from ..recordings.sniffing import sniff
 
             guess = sniff(source, _named_columns(args))
-            taken = f'{source} is taken for {guess.why}: convert {guess.kind}'
-            warn(taken)
+            warn(f'{source} is taken for {guess.why}: convert {guess.kind}')
             args = [guess.kind, *args]
         elif source.suffix:
             ctx.fail(f'{source} does not exist')
@@ -92,9 +91,8 @@ def _add_subcommand(kind: str, options: type) -> None:
         print_json(_described(report)) if as_json else _print(report)
 
     examples = (f'sonar-imm convert {kind} {line}' for line in options.EXAMPLES)  # type: ignore[attr-defined]
-    subcommand = click.Command(
-        kind, callback=run, help=inspect.getdoc(options), epilog=opt.example(*examples)
-    )
+    about = {'help': inspect.getdoc(options), 'epilog': opt.example(*examples)}
+    subcommand = click.Command(kind, callback=run, **about)
     click.argument('source', metavar='IN', type=opt.PATH)(subcommand)
     click.argument('out_bag', type=opt.PATH, required=False)(subcommand)
     for decorate in _click_options(options):
@@ -176,7 +174,7 @@ def _click_type(spec: Option) -> Any:
 
 
 def _parsed(parse: Callable[[str], Any]) -> Callable[..., Any]:
-    def callback(_ctx: click.Context, _param: click.Parameter, text: str | None) -> Any:
+    def callback(_ctx: Any, _param: Any, text: str | None) -> Any:
         try:
             return None if text is None else parse(text)
         except ValueError as error:

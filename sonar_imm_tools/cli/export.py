@@ -109,13 +109,7 @@ Told = tuple[dict[str, Any], str]
 
 def _export_soundings(asked: _Asked, cell: float) -> Told:
     from ..offline.run_folder import RUN
-    from ..recordings.export.points import (
-        origin_of,
-        read_points,
-        write_las,
-        write_table,
-        write_xyz,
-    )
+    from ..recordings.export import points as export
     from ..recordings.sources import BagError
     from ..survey.chart import chart_of, OF_ONE_RUN, write_geotiff
     from ..survey.line import budget_of, unstated, without_far
@@ -125,8 +119,8 @@ def _export_soundings(asked: _Asked, cell: float) -> Told:
             f'{asked.run} holds no soundings: the recording has no navigation, or is of another '
             'system'
         )
-    own = origin_of(asked.record, asked.run)
-    whole_run = read_points(place).placed(own, asked.epsg, asked.origin)
+    own = export.origin_of(asked.record, asked.run)
+    whole_run = export.read_points(place).placed(own, asked.epsg, asked.origin)
     points = without_far(whole_run)
     result: dict[str, Any] = {'soundings': len(points)}
     shape = ''
@@ -140,11 +134,11 @@ def _export_soundings(asked: _Asked, cell: float) -> Told:
                 result['assumed'] = missing
                 shape += f'; {RUN} does not state {", ".join(missing)}: default values'
         elif asked.kind == 'xyz':
-            write_xyz(unfinished, points)
+            export.write_xyz(unfinished, points)
         elif asked.kind == 'csv':
-            write_table(unfinished, points)
+            export.write_table(unfinished, points)
         else:
-            write_las(unfinished, points, asked.epsg)
+            export.write_las(unfinished, points, asked.epsg)
     if far := len(whole_run) - len(points):
         result['far'] = far
         shape += f'; {far} far away left out: no ship that sees the others can have seen them'
@@ -162,16 +156,14 @@ def _export_map(asked: _Asked) -> Told:
     if not landmarks:
         raise BagError(f'{asked.run} knows no obstacles at its end')
     if asked.epsg is None:
-        raise click.UsageError(
-            'places are in metres: say with --epsg and --origin where their origin lies'
-        )
+        why = 'places are in metres: say with --epsg and --origin where their origin lies'
+        raise click.UsageError(why)
     try:
         with whole(asked.out) as unfinished:
             write_obstacles(unfinished, landmarks, asked.epsg, asked.origin)
     except (KeyError, TypeError, ValueError):
-        raise BagError(
-            f"'landmarks' in the run.json of {asked.run} cannot be understood"
-        ) from None
+        why = f"'landmarks' in the run.json of {asked.run} cannot be understood"
+        raise BagError(why) from None
     return {'obstacles': len(landmarks)}, f'{len(landmarks)} obstacles'
 
 
@@ -222,9 +214,8 @@ def _export_horizons(asked: _Asked, original: Path | None) -> Told:
         raise BagError(f'{run} is of the fathometer: .{kind} is for tracks')
     segy = kind in ('sgy', 'segy', 'seg')
     if segy and original is None:
-        raise click.UsageError(
-            'SEG-Y needs --segy, the file that the recording was converted from'
-        )
+        why = 'SEG-Y needs --segy, the file that the recording was converted from'
+        raise click.UsageError(why)
     positions, notes, degrees = None, {}, _to_degrees(asked)
     if Path(record['bag']).exists():
         with BagReader(record['bag']) as bag:

@@ -33,9 +33,7 @@ def example(*lines: str) -> str:
     return '\b\nExample:\n' + '\n'.join(f'  {line}' for line in lines)
 
 
-def _coordinates(
-    _ctx: click.Context, _param: click.Parameter, value: str
-) -> tuple[float, float, float]:
+def _coordinates(_ctx: Any, _param: Any, value: str) -> tuple[float, float, float]:
     try:
         numbers = tuple(float(part) for part in value.split(','))
     except ValueError:
@@ -49,9 +47,7 @@ def _coordinates(
 def pairs(*names: str, metavar: str, help: str) -> Callable[..., Any]:
     """An option of the form NAME=VALUE that may be repeated; the command gets a dict."""
 
-    def split(
-        _ctx: click.Context, _param: click.Parameter, values: Iterable[str]
-    ) -> dict[str, str]:
+    def split(_ctx: Any, _param: Any, values: Iterable[str]) -> dict[str, str]:
         pairs = {}
         for value in values:
             name, equals, text = value.partition('=')

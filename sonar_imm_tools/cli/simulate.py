@@ -61,33 +61,27 @@ def command(
         return
     if out_bag is None:
         raise click.UsageError("Missing argument 'OUT_BAG'")
+    name = scenario or next(iter(scenes.SCENARIOS))
+    config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     if system == SURVEY:
-        _simulate_survey(scenes, out_bag, scenario, seed, overrides, soundings, compress, as_json)
+        result, text = _simulate_survey(scenes, config, name, out_bag, seed, soundings, compress)
+        print_json(result) if as_json else say(text)
         return
     from sonar_imm.truth import TrueTrack
 
     from ..recordings.own_files import own_parameters, unusual
     from ..recordings.truth import write_scene
 
-    name = scenario or next(iter(scenes.SCENARIOS))
-    config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     scene = scenes.simulate(config, seed)
     known = unusual(config.instruments(), SYSTEMS[system].config_type())
     sections = {system: known}
     if fed := config.feeder_instruments():
         # A scene writes its images as the only type that needs no further package.
         sections[FEEDERS[system]] = {'input_types': ['image=sensor_msgs/msg/Image'], **fed}
+    notes = {'source': f'simulated: {system} {name}', 'seed': str(seed), 'sonar_imm': __version__}
+    notes |= {f'set {key}': value for key, value in sorted(overrides.items())}
     report = write_scene(
-        scene,
-        out_bag,
-        compressed=compress,
-        parameters=sections,
-        provenance={
-            'source': f'simulated: {system} {name}',
-            'seed': str(seed),
-            'sonar_imm': __version__,
-            **{f'set {key}': value for key, value in sorted(overrides.items())},
-        },
+        scene, out_bag, compressed=compress, parameters=sections, provenance=notes
     )
     parameters = own_parameters(out_bag)
     targets = sum(isinstance(true, TrueTrack) for true in scene.truth)
@@ -110,16 +104,9 @@ def command(
 
 
 def _simulate_survey(
-    scenes: Any,
-    out: Path,
-    scenario: str | None,
-    seed: int,
-    overrides: dict[str, str],
-    soundings: bool,
-    compress: bool,
-    as_json: bool,
-) -> None:
-    """Folders of lines, or bags, and truth.npz."""
+    scenes: Any, config: Any, name: str, out: Path, seed: int, soundings: bool, compress: bool
+) -> tuple[dict[str, Any], str]:
+    """Folders of lines, or bags, and truth.npz; what was made, as JSON and in words."""
     from sonar_imm.files import whole
 
     from ..recordings.export.points import write_table
@@ -127,8 +114,6 @@ def _simulate_survey(
     from ..recordings.sources import BagError
     from ..recordings.truth import write_scene
 
-    name = scenario or next(iter(scenes.SCENARIOS))
-    config = scenes.scenario(name, typed_overrides(scenes.SurveyScenario, overrides))
     if out.exists():
         raise BagError(f'{out} is there already; choose another folder')
     system, what, total = 'bathymetry', 'soundings' if soundings else 'messages', 0
@@ -152,20 +137,16 @@ def _simulate_survey(
                 total += sum(report.messages.values())
         scenes.write_truth(folder / 'truth.npz', scene)
     result = {'out': str(out), 'scenario': name, 'seed': seed, 'lines': len(scene.names)}
-    result[what] = total
-    if as_json:
-        print_json(result)
-    else:
-        say(f'{out}: {len(scene.names)} lines, {total} {what} ({name}, seed {seed})')
+    text = f'{out}: {len(scene.names)} lines, {total} {what} ({name}, seed {seed})'
+    return {**result, what: total}, text
 
 
 def _list(scenes: Any, as_json: bool) -> None:
     described = {name: entry[0] for name, entry in scenes.SCENARIOS.items()}
     specs = type(scenes.scenario(next(iter(described)))).specs()
     if as_json:
-        print_json(
-            {'scenarios': described, 'parameters': {spec.name: spec.description for spec in specs}}
-        )
+        parameters = {spec.name: spec.description for spec in specs}
+        print_json({'scenarios': described, 'parameters': parameters})
         return
     for name, description in described.items():
         say(f'{name:<20} {description}')

@@ -33,9 +33,7 @@ if TYPE_CHECKING:
     from ..recordings.reader import BagReader
 
 
-def _shard(
-    _ctx: click.Context, _param: click.Parameter, value: str | None
-) -> tuple[int, int] | None:
+def _shard(_ctx: Any, _param: Any, value: str | None) -> tuple[int, int] | None:
     if value is None:
         return None
     numbers = value.split('/')
@@ -111,18 +109,12 @@ def command(
         raise click.UsageError('--jobs and --scheduler exclude each other')
     if parquet and no_table:
         raise click.UsageError('--parquet and --no-table exclude each other')
-    from ..offline.run_folder import (
-        AS_CSV,
-        AS_PARQUET,
-        NO_TABLE,
-        require_parquet,
-        SHARD_SUMMARY,
-        SUMMARY,
-    )
+    from ..offline import run_folder as results
 
     if parquet:
-        require_parquet()
-    tables = AS_PARQUET if parquet else NO_TABLE if no_table else AS_CSV
+        results.require_parquet()
+    tables = results.NO_TABLE if no_table else results.AS_CSV
+    tables = results.AS_PARQUET if parquet else tables
     plan = Plan(tables=tables, **options)
     if len(bags) == 1 and shard is None:
         runs = plan.jobs(bags[0], out_dir, lambda sentence: say(sentence, quiet=as_json))
@@ -137,7 +129,7 @@ def command(
         failures: list[Outcome] = []
     else:
         runs, failures = _of_all(plan, bags, out_dir, shard or (1, 1))
-    summary = SUMMARY if shard is None else SHARD_SUMMARY.format(*shard)
+    summary = results.SUMMARY if shard is None else results.SHARD_SUMMARY.format(*shard)
     _track_all(runs, failures, out_dir, summary, jobs, scheduler, as_json)
 # fmt: on
 
@@ -338,12 +330,8 @@ def choose_system(
         inputs = {*(topics or {}).values()}
         meant = [system for system in SYSTEMS if inputs and knows_inputs(system, inputs)]
         fits = fitting_systems(reader)
-        best = (
-            [system for system in fits if system in meant]
-            or meant
-            or fits
-            or [system_in_mind(reader)]
-        )
+        both = [system for system in fits if system in meant]
+        best = both or meant or fits or [system_in_mind(reader)]
         instruments(reader, best[0], topics)
     return SYSTEMS[found[0]]
 
@@ -353,12 +341,12 @@ def track_one(job: Job, quiet: bool = False) -> dict[str, Any]:
     from ..offline.batch import track
 
     with contextlib.ExitStack() as stack:
-        outcome = track(
-            job,
-            lambda total: stack.enter_context(
-                progress('tracking', total, quiet=quiet, first='loading kernels')
-            ),
-        )
+
+        def begin(total: int) -> Callable[[int], None]:
+            bar = progress('tracking', total, quiet=quiet, first='loading kernels')
+            return stack.enter_context(bar)
+
+        outcome = track(job, begin)
     return dict(outcome.run or {})
 
 

@@ -19,6 +19,7 @@ for all columns that begin like it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from itertools import product
 from typing import Any, TypeVar
 
 from attrs import evolve, field, fields, frozen
@@ -55,13 +56,10 @@ class _Columns:
             return np.asarray(table.get(plain, np.full(rows, self.default)), self.dtype)
 
         if self.prefix:
-            pairs = [
-                (a, b) if i <= j else (b, a)
-                for i, a in enumerate(self.names)
-                for j, b in enumerate(self.names)
-            ]
+            order = {name: place for place, name in enumerate(self.names)}
+            pairs = (sorted(pair, key=order.__getitem__) for pair in product(self.names, repeat=2))
             flat = [values(f'{self.prefix}_{a}_{b}?') for a, b in pairs]
-            return np.column_stack(flat).reshape(rows, len(self.names), len(self.names))
+            return np.column_stack(flat).reshape(rows, len(order), len(order))
         if self.names[0].endswith('*'):
             found = [values(name) for name in table if name.startswith(self.names[0][:-1])]
             return np.column_stack(found or [np.empty((rows, 0))])
@@ -136,8 +134,5 @@ def read_columns(table: Estimate, names: Iterable[str], missing: str) -> dict[st
 
 
 def _declared(kind: type[Rows]) -> dict[str, _Columns]:
-    return {
-        entry.name: entry.metadata[_COLUMNS]
-        for entry in fields(kind)
-        if _COLUMNS in entry.metadata
-    }
+    declared = (entry for entry in fields(kind) if _COLUMNS in entry.metadata)
+    return {entry.name: entry.metadata[_COLUMNS] for entry in declared}

@@ -243,19 +243,17 @@ def thumbnail(figure: go.Figure) -> str:
     """
     traces = [trace for trace in figure.data if trace.type in ('scatter', 'scattergl')]
     traces = [trace for trace in traces if (trace.xaxis or 'x') == 'x' and len(trace.x)]
-    points = [_points(trace) for trace in traces]
+    points = [np.array([trace.x, trace.y], dtype=float).T for trace in traces]
+    points = [
+        xy if trace.fill else xy[thin(len(xy), THUMBNAIL_POINTS)]
+        for trace, xy in zip(traces, points)
+    ]
     place = _placement(figure.layout, points)
     shapes = ''.join(_shapes(trace, place(xy)) for trace, xy in zip(traces, points))
     return (
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" aria-hidden="true" fill="none" '
         f'stroke-linecap="round">{shapes}</svg>'
     )
-
-
-def _points(trace: Any) -> FloatArray:
-    """Return the points of a trace, (N, 2), NaN where its line is broken."""
-    xy = np.column_stack([np.asarray(trace.x, dtype=float), np.asarray(trace.y, dtype=float)])
-    return xy if trace.fill else xy[thin(len(xy), THUMBNAIL_POINTS)]
 
 
 def _placement(layout: go.Layout, points: list[FloatArray]) -> Any:
@@ -287,35 +285,26 @@ def _placement(layout: go.Layout, points: list[FloatArray]) -> Any:
 
 def _shapes(trace: Any, pixels: FloatArray) -> str:
     """Return the paths of one trace; pixels: (N, 2)."""
-    shapes = ''
-    mode = trace.mode or 'lines'
+    shapes, mode = '', trace.mode or 'lines'
     line, marker = trace.line, trace.marker
     if trace.fill:
-        shapes += f'<path fill="{trace.fillcolor}" stroke="none" d="{_path(pixels)}"/>'
+        shapes = f'<path fill="{trace.fillcolor}" stroke="none" d="{_path(pixels)}"/>'
     elif 'lines' in mode:
+        look = f'stroke="{line.color or GREY}" stroke-width="1.5"'
         dash = ' stroke-dasharray="2 3"' if line.dash else ''
-        shapes += (
-            f'<path stroke="{line.color or GREY}" stroke-width="1.5"{dash} d="{_path(pixels)}"/>'
-        )
+        shapes = f'<path {look}{dash} d="{_path(pixels)}"/>'
     if mode == 'markers':
         colour = marker.color if isinstance(marker.color, str) else marker.line.color
-        shapes += (
-            f'<path stroke="{colour or GREY}" stroke-width="2.5" '
-            f'd="{"".join(f"M{x:.1f} {y:.1f}h0" for x, y in pixels[_finite(pixels)])}"/>'
-        )
+        dots = ''.join(f'M{x:.1f} {y:.1f}h0' for x, y in pixels[np.isfinite(pixels).all(axis=1)])
+        shapes += f'<path stroke="{colour or GREY}" stroke-width="2.5" d="{dots}"/>'
     return shapes
 
 
 def _path(pixels: FloatArray) -> str:
     """Return the commands of a path that is broken at NaN."""
-    parts = []
-    pen_up = True
-    for (x, y), drawn in zip(pixels, _finite(pixels)):
+    parts, pen_up = [], True
+    for (x, y), drawn in zip(pixels, np.isfinite(pixels).all(axis=1)):
         if drawn:
             parts.append(f'{"M" if pen_up else "L"}{x:.1f} {y:.1f}')
         pen_up = not drawn
     return ''.join(parts)
-
-
-def _finite(pixels: FloatArray) -> Any:
-    return np.isfinite(pixels).all(axis=1)

@@ -372,8 +372,9 @@ def prepared(jobs: Sequence[Job], names: Sequence[str]) -> tuple[Fitting, int]:
     tunables = tuple(t for t in every if (t.name in names if names else t.usual))
     for tunable in tunables:
         if len({str(getattr(each.config, tunable.name)) for each in recordings}) > 1:
+            name = tunable.name
             raise ConfigError(
-                f'the recordings have different {tunable.name}: --params or --set gives them one'
+                f'the recordings have different {name}: --params or --set gives them one'
             )
     split, count = [], 0
     for recording in recordings:

@@ -68,7 +68,9 @@ def _fresh(count: int) -> ProcessPoolExecutor:
         ) from None
 
 
-Run = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Iterator[tuple[int, Any, str]]]
+Work, Calls = Callable[..., Any], Sequence[tuple[Any, ...]]
+Ended = Iterator[tuple[int, Any, str]]
+Run = Callable[[Work, Calls], Ended]
 """``run(work, calls)``: as they end, the number of each call, what came of it, and the sentence
 why nothing did."""
 
@@ -92,9 +94,7 @@ def workers(
             yield pool.run
 
 
-def _in_turn(
-    work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
-) -> Iterator[tuple[int, Any, str]]:
+def _in_turn(work: Work, calls: Calls) -> Ended:
     for k, call in enumerate(calls):
         try:
             result = work(*call)
@@ -118,9 +118,7 @@ class _Pool:
         if self._executor is not None:
             self._executor.shutdown(wait=error[0] is None, cancel_futures=True)
 
-    def run(
-        self, work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
-    ) -> Iterator[tuple[int, Any, str]]:
+    def run(self, work: Work, calls: Calls) -> Ended:
         left = dict(enumerate(calls))
         yield from self._some(work, left)
         for k in list(left):  # those that were under way or not begun when a process died
@@ -129,9 +127,7 @@ class _Pool:
             if alone:
                 yield k, None, 'the process that did it was ended, perhaps for lack of memory'
 
-    def _some(
-        self, work: Callable[..., Any], left: dict[int, tuple[Any, ...]]
-    ) -> Iterator[tuple[int, Any, str]]:
+    def _some(self, work: Work, left: dict[int, tuple[Any, ...]]) -> Ended:
         """Do what is `left`, and take away what was done, until a process dies."""
         if self._executor is None:
             self._executor = _fresh(self._count)
@@ -174,9 +170,8 @@ def cluster(address: str, note: Callable[[str], None] = lambda sentence: None) -
     try:
         identity = asyncio.run(asyncio.wait_for(_identity(address), CONNECT_SECONDS))
     except asyncio.TimeoutError:
-        raise ConfigError(
-            f'no dask scheduler answers at {address} within {CONNECT_SECONDS:g} s'
-        ) from None
+        within = f'within {CONNECT_SECONDS:g} s'
+        raise ConfigError(f'no dask scheduler answers at {address} {within}') from None
     except Exception as error:  # whatever a program says that is no scheduler
         raise ConfigError(f'no dask scheduler at {address}: {sentence_of(error)}') from None
     if not identity.get('workers'):
@@ -194,9 +189,7 @@ async def _identity(address: str) -> dict[str, Any]:
         return await remote.identity()
 
 
-def as_they_end(
-    client: Any, work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
-) -> Iterator[tuple[int, Any, str]]:
+def as_they_end(client: Any, work: Work, calls: Calls) -> Ended:
     """``work(*call)`` for each of `calls` on the workers of a dask client: the number of the call,
     what came of it, and the sentence why nothing did. A worker may have died, or the scheduler be
     gone."""

@@ -139,20 +139,26 @@ class LockStep:
                 f"no answer from a node '{self._name}': is it running, in this ROS "
                 'domain, and one of this package?'
             )
-        topics = {p.topic_name for p in publishers}
+        node, topics = self._link.node, {p.topic_name for p in publishers}
         hearing: set[str] = set()
         last = time.monotonic()
 
-        def connected() -> bool:
+        def connected() -> object:
             nonlocal last
-            if fresh := self._subscribed(publishers) - hearing:
-                hearing.update(fresh)
+            heard = {
+                p.topic_name
+                for p in publishers
+                for info in node.get_subscriptions_info_by_topic(p.topic_name)
+                if _full_name(info) == self._name
+            }
+            if heard - hearing:
+                hearing.update(heard)
                 last = time.monotonic()
             return (
                 bool(hearing)
                 and (hearing == topics or time.monotonic() - last > _OTHER_INPUTS)
                 and all(p.get_subscription_count() for p in publishers if p.topic_name in hearing)
-                and self._recorded()
+                and (self._recorder is None or node.count_publishers(f'{self._name}/estimate'))
             )
 
         if not self._link.wait_for(connected, MATCH_LIMIT, self._trouble):
@@ -221,11 +227,6 @@ class LockStep:
             self._recorder is None or len(self._recorder) >= self.counts.estimates
         )
 
-    def _recorded(self) -> bool:
-        return self._recorder is None or bool(
-            self._link.node.count_publishers(f'{self._name}/estimate')
-        )
-
     def _lost(self) -> str | None:
         if sentence := self._trouble():
             return sentence
@@ -233,22 +234,13 @@ class LockStep:
             return f"node '{self._name}' has gone"
         return None
 
-    def _subscribed(self, publishers: list[Publisher]) -> set[str]:
-        """Topics among those of `publishers` that the node itself subscribes to."""
-        return {
-            p.topic_name
-            for p in publishers
-            if any(
-                _full_name(info) == self._name
-                for info in self._link.node.get_subscriptions_info_by_topic(p.topic_name)
-            )
-        }
-
     def _silence(self, publishers: list[Publisher], hearing: set[str]) -> str:
         """Say why no topic of the bag reaches the node."""
         for publisher in publishers:
             for info in self._link.node.get_subscriptions_info_by_topic(publisher.topic_name):
-                wanted, offered = info.topic_type, _type_name(publisher)
+                kind: Any = publisher.msg_type
+                offered = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+                wanted = info.topic_type
                 if _full_name(info) == self._name and wanted != offered:
                     return (
                         f"node '{self._name}' expects {wanted} on {publisher.topic_name}, the "
@@ -303,10 +295,10 @@ class Chain:
     def connect(self, publishers: Iterable[Publisher], limit: float = MATCH_LIMIT) -> set[str]:
         """As `LockStep.connect`, for both nodes and for what one sends to the other."""
         publishers = list(publishers)
-        connected = self.first.connect([p for p in publishers if p.topic_name in self._fed], limit)
-        connected |= self.second.connect(
-            [p for p in publishers if p.topic_name not in self._fed], limit
-        )
+        fed = [p for p in publishers if p.topic_name in self._fed]
+        connected = self.first.connect(fed, limit)
+        rest = [p for p in publishers if p.topic_name not in self._fed]
+        connected |= self.second.connect(rest, limit)
         if not self.first.wait_for(lambda: self.first.listeners):
             raise LinkError('the second node does not hear what the first one makes')
         return connected
@@ -325,9 +317,3 @@ class Chain:
 
 def _full_name(info: Any) -> str:
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-
-
-def _type_name(publisher: Publisher) -> str:
-    message_type: Any = publisher.msg_type
-    package, _, name = message_type.__module__.partition('.')
-    return f'{package}/msg/{message_type.__name__}'

@@ -322,13 +322,12 @@ def hillshaded(chart: Chart, thin: int) -> Picture:
     depth = chart.bands['depth'][::thin, ::thin]
     figure = _image(chart, chart.bands['depth'], thin, 'depth [m]', 'Viridis_r')
     # Rows go south.
-    down, east = (
-        np.gradient(-depth, thin * chart.cell) if min(depth.shape) > 1 else (0 * depth,) * 2
-    )
+    down = east = 0 * depth
+    if min(depth.shape) > 1:
+        down, east = np.gradient(-depth, thin * chart.cell)
     azimuth, elevation = SUN
-    light = math.sin(elevation) - math.cos(elevation) * (
-        math.sin(azimuth) * east - math.cos(azimuth) * down
-    )
+    across = math.sin(azimuth) * east - math.cos(azimuth) * down
+    light = math.sin(elevation) - math.cos(elevation) * across
     shade = np.clip(light / np.sqrt(1.0 + np.square(east) + np.square(down)), 0.0, 1.0)
     x, y = chart.axes(thin)
     figure.add_heatmap(
@@ -367,10 +366,8 @@ def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str
     if colours == 'RdBu':
         high = max(abs(low), abs(high))
         low = -high
-    figure = Picture()
-    figure.add_heatmap(
-        x=x, y=y, z=shown, colorscale=colours, zmin=low, zmax=high, colorbar={'title': title}
-    )
+    figure, bar = Picture(), {'title': title}
+    figure.add_heatmap(x=x, y=y, z=shown, colorscale=colours, zmin=low, zmax=high, colorbar=bar)
     axis = {'zeroline': False, 'tickformat': 'd'}
     east = {'title': 'east [m]', 'constrain': 'domain', 'nticks': 5, **axis}
     north = {'title': 'north [m]', 'scaleanchor': 'x', **axis}

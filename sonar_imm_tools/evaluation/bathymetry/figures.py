@@ -29,14 +29,7 @@ from ...offline.run_folder import read_measurements, RunFolder
 from ...recordings.export.points import Points, read_points
 from ...survey.chart import Chart, chart_of
 from ...survey.line import budget_of, without_far
-from ..plotting import (
-    AMBER,
-    BARE,
-    COLOURS,
-    INK,
-    Picture,
-    thin,
-)
+from ..plotting import AMBER, BARE, COLOURS, INK, Picture, thin
 from ..report import Section
 from .scoring import BAND, Profile, runs, Swath
 

@@ -79,9 +79,8 @@ def sections(
             error_figure(matching, track_id),
         )
     else:
-        yield Section(
-            'Stated uncertainty', f'One sigma on each axis.{which}', sigma_figure(series, track_id)
-        )
+        text = f'One sigma on each axis.{which}'
+        yield Section('Stated uncertainty', text, sigma_figure(series, track_id))
     if series.model_names:
         yield Section(
             'Which motion model held',
@@ -145,9 +144,8 @@ def map_figure(
         # Labels are HTML.
         _add_track(figure, track, order, escape(series.name(track_id, names or {})))
     # Clutter can lie anywhere: the first view shows tracks and truth, the rest by zooming out.
-    x_range, y_range = view_of(
-        np.concatenate([series.state[:, :2], *(path.state[:, :2] for path in paths)])
-    )
+    every = [series.state[:, :2], *(path.state[:, :2] for path in paths)]
+    x_range, y_range = view_of(np.concatenate(every))
     y = {'title': 'y [m]', 'range': y_range, 'scaleanchor': 'x', 'scaleratio': 1}
     return figure.styled(640, {'title': 'x [m]', 'range': x_range}, y)
 
@@ -262,9 +260,7 @@ def headings_together(
 
 def model_order(names: tuple[str, ...]) -> list[int]:
     """Indices of `names`: other models first, that is at the bottom, then headings by angle."""
-    return sorted(
-        range(len(names)), key=lambda index: (names[index].startswith('heading_'), names[index])
-    )
+    return sorted(range(len(names)), key=lambda k: (names[k].startswith('heading_'), names[k]))
 
 
 def model_label(name: str) -> str:

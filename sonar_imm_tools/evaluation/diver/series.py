@@ -94,9 +94,8 @@ def series_of(estimates: Iterable[Estimate]) -> Series:
     models = {estimate.model_names for estimate in estimates if len(estimate)}
     if len(models) > 1:
         raise ValueError('the models change within the recording: it holds more than one run')
-    series = read_rows(
-        Series, estimates, "the estimates have no column '{}'", model_names=next(iter(models), ())
-    )
+    missing, names = "the estimates have no column '{}'", next(iter(models), ())
+    series = read_rows(Series, estimates, missing, model_names=names)
     return evolve(series, scan_ns=np.unique(series.scan_ns))
 
 

@@ -133,15 +133,11 @@ def _record(estimate: Estimate, true: Reflections | None) -> Record:
 
 
 def _true(estimate: Estimate) -> Reflections:
-    columns = read_columns(
-        estimate, _TRUE, "the truth is not that of reflectors: it has no column '{}'"
-    )
-    ids = columns['track_id']
+    missing = "the truth is not that of reflectors: it has no column '{}'"
+    depth, amplitude, ids = read_columns(estimate, _TRUE, missing).values()
     ids = np.where(np.isfinite(ids), ids, np.arange(len(ids)))
-    there = np.isfinite(columns['depth'])
-    return Reflections(
-        columns['depth'][there], columns['amplitude'][there], ids[there].astype(np.int64)
-    )
+    there = np.isfinite(depth)
+    return Reflections(depth[there], amplitude[there], ids[there].astype(np.int64))
 
 
 CUTOFF = 2.0

@@ -57,12 +57,12 @@ def score(
     series: Series, truth: tuple[TruePath, ...] | None, *, cutoff: float, gap: float
 ) -> tuple[dict[str, Any], Matching | None]:
     """All metrics of a run, and the matching they rest on. Without truth only what needs none."""
-    pings = series.scan_ns
+    pings, tracks = series.scan_ns, len(np.unique(series.track_id))
     nis = series.nis[np.isfinite(series.nis)]
     metrics: dict[str, Any] = {
         'pings': len(pings),
         'span_s': float(np.ptp(pings)) / SECOND if len(pings) else 0.0,
-        'tracks_confirmed': len(np.unique(series.track_id)),
+        'tracks_confirmed': tracks,
         'rows_confirmed': len(series),
         'consistency': {'nis': chi2_summary(nis, 2)},
     }
@@ -83,9 +83,8 @@ def score(
         'tracks': {
             'true_obstacles': len(truth),
             'found_obstacles': len(np.unique(found.target)),
-            'tracks': metrics['tracks_confirmed'],
-            'false_tracks': metrics['tracks_confirmed']
-            - len(np.unique(series.track_id[found.row])),
+            'tracks': tracks,
+            'false_tracks': tracks - len(np.unique(series.track_id[found.row])),
             'identity_switches': identity_switches(followed_by(found, len(truth))),
         },
     }
@@ -214,16 +213,11 @@ def behaviour_scores(found: Matching, truth: Sequence[TruePath]) -> dict[str, An
     if not len(rows):
         return {}
     true = np.array([truth[found.target[k]].does[at[k]] for k in rows])
-    confusion = {
-        BEHAVIOURS[kind]: {
-            'n': int((true == kind).sum()),
-            **{
-                name: float(stated[rows][true == kind, i].mean())
-                for i, name in enumerate(BEHAVIOURS)
-            },
-        }
-        for kind in np.unique(true)
-    }
+    confusion: dict[str, dict[str, float]] = {}
+    for kind in np.unique(true):
+        means = stated[rows][true == kind].T
+        each = {name: float(np.mean(column)) for name, column in zip(BEHAVIOURS, means)}
+        confusion[BEHAVIOURS[kind]] = {'n': int((true == kind).sum()), **each}
     off = stated[rows] - np.eye(len(BEHAVIOURS))[true]
     return {'confusion': confusion, 'brier': float(np.mean(np.sum(off**2, axis=1)))}
 
@@ -263,9 +257,8 @@ def _outcomes(path: TruePath, config: ObstacleConfig) -> FloatArray:
     t = path.stamp_ns / SECOND
     distance, _, offset = path.seen.T
     level = np.sqrt(np.maximum(distance**2 - offset**2, 0.0))
-    hits = np.flatnonzero(
-        (level <= config.safety_radius) & (np.abs(offset) <= config.safety_height)
-    )
+    near = level <= config.safety_radius
+    hits = np.flatnonzero(near & (np.abs(offset) <= config.safety_height))
     outcome = np.full(len(t), np.nan)
     # Passed: it was nearest before the end, and is out of reach when the truth ends.
     nearest = int(np.argmin(level))

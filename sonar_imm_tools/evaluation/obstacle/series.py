@@ -96,9 +96,8 @@ class TruePath:
         start, end = self.stamp_ns[after - 1], self.stamp_ns[after]
         fraction = (stamp_ns - start) / np.maximum(end - start, 1)
         known = (fraction >= 0.0) & (fraction <= 1.0) & (end - start <= gap * SECOND)
-        between = self.seen[after - 1] + fraction[:, None] * (
-            self.seen[after] - self.seen[after - 1]
-        )
+        before = self.seen[after - 1]
+        between = before + fraction[:, None] * (self.seen[after] - before)
         return np.where(known[:, None], between, np.nan)
 
     def there(self, stamp_ns: IntArray, gap: float) -> NDArray[np.bool_]:
@@ -132,9 +131,8 @@ class Matching:
 
 def series_of(estimates: Iterable[Estimate]) -> Series:
     """The confirmed rows. Raises ValueError for estimates of another system."""
-    series = read_rows(
-        Series, estimates, "the estimates are not those of obstacles: there is no column '{}'"
-    )
+    missing = "the estimates are not those of obstacles: there is no column '{}'"
+    series = read_rows(Series, estimates, missing)
     return series.pick(series.track_state > 0)
 
 
@@ -180,9 +178,8 @@ def match(series: Series, truth: tuple[TruePath, ...], *, cutoff: float, gap: fl
         targets += who[hit].tolist()
     row, target = np.array(rows, np.int64), np.array(targets, np.int64)
     at = np.searchsorted(pings, series.stamp_ns[row])
-    return Matching(
-        series, row, target, seen[target, at].reshape(-1, 3), np.reshape(scores, (-1, 4))
-    )
+    true = seen[target, at].reshape(-1, 3)
+    return Matching(series, row, target, true, np.reshape(scores, (-1, 4)))
 
 
 def level(seen: FloatArray) -> FloatArray:

@@ -251,19 +251,14 @@ def simulate(config: BathymetryScenario, seed: int) -> Scene:
 
 
 def _floor(
-    config: BathymetryScenario,
-    ping: int,
-    ranges: FloatArray,
-    rng: Generator,
-    side: str,
+    config: BathymetryScenario, ping: int, ranges: FloatArray, rng: Generator, side: str
 ) -> TrueProfile:
     """The floor below a sonar that rests, of which `simulate` knows the stamp."""
     drift = ping * config.patch_drift
     patch = (ranges >= config.patch_start + drift) & (ranges < config.patch_end + drift)
     height = config.slope * (ranges - ranges[0]) + patch * _roughness(config, len(ranges), rng)
-    height += config.undulation_height * np.sin(
-        2.0 * np.pi * (ranges - ranges[0]) / config.undulation_length
-    )
+    waves = 2.0 * np.pi * (ranges - ranges[0]) / config.undulation_length
+    height += config.undulation_height * np.sin(waves)
     depth = config.sonar_height - height
     valid = np.abs(depth) <= ranges  # before that, the sound is still in the water column
     valid &= _lit(config, ranges)
@@ -459,9 +454,8 @@ def _of_facets(
 def _echo(config: BathymetryScenario, sine: FloatArray, rng: Generator) -> ComplexArray:
     """Plane waves (n, P) of unit power from direction sines (n,), less what differs from stave to
     stave."""
-    vectors = array.steering(
-        sine, config.staves, config.spacing_wavelengths, conjugate=config.conjugate
-    )
+    shape = config.staves, config.spacing_wavelengths
+    vectors = array.steering(sine, *shape, conjugate=config.conjugate)
     share = config.decorrelation
     wave = vectors * _circular(rng, len(sine), 1)
     if not share > 0.0:

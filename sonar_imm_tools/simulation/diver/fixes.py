@@ -114,9 +114,8 @@ def vessel_at(stamp_ns: int) -> tuple[FloatArray, FloatArray]:
     seconds = (stamp_ns + _HALF_NS) % (2 * _HALF_NS) * 1e-9 - _HALF_NS * 1e-9
     angle = VESSEL_SPEED * seconds / RADIUS
     place = RADIUS * np.array([np.cos(angle), np.sin(angle), 0.0])
-    return place, np.array(
-        [0.05 * np.sin(seconds), 0.03 * np.sin(0.7 * seconds), angle + 0.5 * np.pi]
-    )
+    roll, pitch = 0.05 * np.sin(seconds), 0.03 * np.sin(0.7 * seconds)
+    return place, np.array([roll, pitch, angle + 0.5 * np.pi])
 
 
 def sense_from_vessel(scan: Any) -> list[VesselPose | RelativeFix]:

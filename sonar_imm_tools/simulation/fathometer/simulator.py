@@ -178,9 +178,8 @@ def _pulses(
     shift = drift.array_depth_stated[record] - drift.array_depth[record]
     # The level of an MVDR response falls with the two-way path plus the length of the array.
     height = drift.depth[record] - drift.array_depth[record]
-    level = (
-        12.0 * drift.amplitude[record] / (2.0 * height + config.phones * config.element_spacing)
-    )
+    length = config.phones * config.element_spacing
+    level = 12.0 * drift.amplitude[record] / (2.0 * height + length)
     there = pulse(depth[:, None] - drift.depth[record] - shift) @ level
     return there + noise, config.noise_sigma
 
