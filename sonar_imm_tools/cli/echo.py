@@ -82,7 +82,6 @@ def command(
 
 @contextlib.contextmanager
 def _shower(most: int, as_json: bool) -> Iterator[Show]:
-    """What shows one table."""
     if as_json:
         yield lambda table: click.echo(json_line(table))
     elif sys.stdout.isatty():

@@ -181,7 +181,6 @@ def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
 
 
 def _export_tracks(asked: _Asked) -> Told:
-    """Tracks of a run of divers or obstacles."""
     from ..evaluation.numbers import counted
     from ..recordings.export.points import origin_of
     from ..recordings.export.tracks import tracks_of, write_tracks
@@ -201,7 +200,6 @@ def _export_tracks(asked: _Asked) -> Told:
 
 
 def _export_horizons(asked: _Asked, original: Path | None) -> Told:
-    """Picks of a run of the fathometer."""
     from ..recordings.export.horizons import picks_of, write_geojson, write_horizons, write_picks
     from ..recordings.positions import navigation_topics, read_navigated, read_positions
     from ..recordings.reader import BagReader

@@ -252,9 +252,9 @@ def cards(shown: Iterable[Metric], metrics: Mapping[str, Any]) -> tuple[Card, ..
     )
 
 
-def front(cards: Iterable[Card], most: int = 3) -> list[Card]:
-    """The few key numbers for the front page: those that are meant for it, then the others."""
-    return sorted(cards, key=lambda card: not card.front)[:most]
+def front(cards: Iterable[Card]) -> list[Card]:
+    """The three key numbers for the front page: those that are meant for it, then the others."""
+    return sorted(cards, key=lambda card: not card.front)[:3]
 
 
 def verdict(shown: Iterable[Metric], metrics: Mapping[str, Any]) -> str:

@@ -284,7 +284,6 @@ def _placement(layout: go.Layout, points: list[FloatArray]) -> Any:
 
 
 def _shapes(trace: Any, pixels: FloatArray) -> str:
-    """Return the paths of one trace; pixels: (N, 2)."""
     shapes, mode = '', trace.mode or 'lines'
     line, marker = trace.line, trace.marker
     if trace.fill:

@@ -257,7 +257,6 @@ def _gl_points(figure: go.Figure) -> int:
 
 
 def _packed_figure(accelerated: Sequence[go.Figure], figure: go.Figure) -> str:
-    """Data and layout of a figure, `packed`."""
     content = plain_content(figure)
     if not any(figure is fast for fast in accelerated):
         for trace in content['data']:

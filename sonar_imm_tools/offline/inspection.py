@@ -43,8 +43,6 @@ LONG_GAP = 10.0
 
 @define
 class _Found:
-    """What was found on one topic."""
-
     topic: TopicInfo
     logs: array[int] = field(factory=lambda: array('q'))
     stamps: array[int] = field(factory=lambda: array('q'))

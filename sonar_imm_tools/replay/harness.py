@@ -189,9 +189,9 @@ class NodeProcess:
         tail = ' | '.join(self.log().splitlines()[-_LOG_TAIL:])
         return f"node '/{self.system}' ended with exit code {code}: {tail or 'no word'}"
 
-    def stop(self, how: signal.Signals = signal.SIGINT) -> int:
+    def stop(self) -> int:
         """Ask the node to stop, then insist; gives its exit code."""
-        for request in (how, signal.SIGTERM, signal.SIGKILL):
+        for request in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             if self.process.poll() is None:
                 self.process.send_signal(request)
                 with contextlib.suppress(subprocess.TimeoutExpired):

@@ -238,7 +238,6 @@ def _swaths(
     first_ns: int,
     rng: Generator,
 ) -> Scene:
-    """Pings and navigation of a line."""
     ship = ship_of(sonar, sonar.sonar_depth, rng)
     ship = ship._replace(start=ship.start + [*start, 0.0])
     level = -KEEL - sonar.sonar_height
@@ -327,7 +326,6 @@ def _floor(config: SurveyScenario, width: float, rng: Generator) -> Floor:
 def _add_ellipsoid(
     z: FloatArray, x: FloatArray, y: FloatArray, place: FloatArray, axes: FloatArray
 ) -> None:
-    """Put half an ellipsoid on the floor."""
     i = slice(*np.searchsorted(x, [place[0] - axes[0], place[0] + axes[0]]))
     j = slice(*np.searchsorted(y, [place[1] - axes[1], place[1] + axes[1]]))
     u = (x[i, None] - place[0]) / axes[0]

@@ -148,9 +148,10 @@ def grid_of_looks(
 
 
 def tiles_of(
-    soundings: Soundings, cell: float, size: int = 256
+    soundings: Soundings, cell: float
 ) -> Iterator[tuple[tuple[int, int, int, int], Soundings]]:
-    """Boxes of size x size cells that hold soundings, each with those it needs."""
+    """Boxes of 256 x 256 cells that hold soundings, each with those it needs."""
+    size = 256
     index = np.floor(soundings.line.xy / cell).astype(np.int64)
     order = np.argsort(index[:, 0], kind='stable')
     column = index[order, 0]

@@ -270,7 +270,6 @@ def _save_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
 
 
 def _columns(line: Line) -> dict[str, np.ndarray]:
-    """The columns of a line as they are kept."""
     columns = {name: getattr(line, name) for name in ('stamp_ns', 'xy', 'z')}
     return columns | {k: getattr(line, k).astype(kind) for k, kind in _STORED.items()}
 

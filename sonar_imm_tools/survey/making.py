@@ -454,7 +454,6 @@ def _neighbours(tiles: Sequence[Tile]) -> dict[str, list[str]]:
 
 
 def _unstated(sources: Sequence[Source], lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return warnings that name the lines whose error budget is assumed, all of it or a part."""
     lacking: dict[str, list[str]] = {}
     for source, line in zip(sources, lines):
         if not line['failure'] and (missing := unstated(source.run)):

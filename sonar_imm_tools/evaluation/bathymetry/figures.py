@@ -157,7 +157,6 @@ def _shade_patches(figure: Picture, profile: Profile) -> None:
 
 
 def _add_upper(figure: Picture, profile: Profile) -> None:
-    """The upper one of two surfaces with its band."""
     assert profile.upper is not None and profile.two is not None
     for number, (begin, end) in enumerate(runs(profile.two)):
         where = profile.range[begin:end]
@@ -168,9 +167,7 @@ def _add_upper(figure: Picture, profile: Profile) -> None:
         figure.line(where, height, 'upper surface', colour, 1.4, **shown)
 
 
-def spectrum_figure(
-    profile: Profile, snapshot: Snapshot, spacing: float, method: str = 'capon'
-) -> Picture:
+def spectrum_figure(profile: Profile, snapshot: Snapshot, spacing: float) -> Picture:
     """Angular pseudo-spectrum of one ping, with the estimated and the true angle.
 
     spacing: distance between staves in wavelengths, negative for a conjugated array.
@@ -179,7 +176,7 @@ def spectrum_figure(
     sines = np.linspace(-largest, largest, DIRECTIONS)
     bins = thin(len(snapshot), MOST_BINS)
     power = spatial.ping_spectrum(
-        snapshot.iq[bins], sines, abs(spacing), method=method, conjugate=spacing < 0.0
+        snapshot.iq[bins], sines, abs(spacing), method='capon', conjugate=spacing < 0.0
     )
     decibels = 10.0 * np.log10(power / power.max(axis=1, keepdims=True))
     angles = np.degrees(np.arcsin(sines))

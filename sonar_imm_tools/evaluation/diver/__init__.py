@@ -175,7 +175,6 @@ def summary_sentence(metrics: Mapping[str, Any]) -> str:
 
 
 def _against_fixes(metrics: Mapping[str, Any]) -> str:
-    """Compare the track with the fixes at the same stamps."""
     same, beyond = metrics['same_stamps'], metrics['raw_fix']['beyond']
     raw = same['raw_rmse_m']
     if not same['n']:

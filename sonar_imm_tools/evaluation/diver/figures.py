@@ -233,13 +233,11 @@ def models_figure(
     return figure.styled(height, TIME | BARE, {'ticktext': labels} | rows | BARE)
 
 
-def outlines(
-    mean: FloatArray, covariance: FloatArray, *, probability: float = 0.95, points: int = 40
-) -> FloatArray:
+def outlines(mean: FloatArray, covariance: FloatArray, *, probability: float = 0.95) -> FloatArray:
     """(m, 2) outlines of Gaussian ellipses that hold `probability`, NaN rows between them."""
     shown = thin(len(mean), MOST_ELLIPSES)
     values, vectors = np.linalg.eigh(covariance[shown])
-    angle = np.linspace(0.0, 2.0 * np.pi, points)
+    angle = np.linspace(0.0, 2.0 * np.pi, 40)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     radii = np.sqrt(-2.0 * np.log1p(-probability) * np.maximum(values, 0.0))
     shape = vectors @ (radii[:, :, None] * circle)

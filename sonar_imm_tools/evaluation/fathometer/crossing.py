@@ -262,7 +262,6 @@ def _meetings(a: FloatArray, b: FloatArray) -> list[tuple[int, int, float, float
 
 
 def _horizons(line: Line, track: FloatArray, at: float, position_std: float) -> list[Horizon]:
-    """The horizons of a line around the fractional record `at`."""
     way = np.append(0.0, np.cumsum(np.hypot(*np.diff(track, axis=0).T)))
     here = float(np.interp(at, np.arange(len(way)), way))
     names = ('depth', 'cov_depth_depth', 'is_bottom', 'multiple_probability')

@@ -151,7 +151,6 @@ def _truths(found: Matching | None, truth: Sequence[TruePath]) -> dict[int, True
 
 
 def _by_track(series: Series) -> Iterator[tuple[str, str, Series]]:
-    """Name, colour and rows of each track."""
     for order, track_id in enumerate(np.unique(series.track_id).tolist()):
         rows = series.pick(series.track_id == track_id)
         yield f'track {track_id}', COLOURS[order % len(COLOURS)], rows

@@ -348,7 +348,6 @@ def _fix(scan: Scan, place: FloatArray, covariance: FloatArray, height: float = 
 
 
 def _sense_arrivals(scan: Scan) -> list[Arrivals]:
-    """Echoes of one ping at every receiver."""
     config, errors, present = scan.config, scan.errors, scan.present
     receivers = RECEIVERS - np.outer(config.receiver_depths, [0.0, 0.0, 1.0])
     tx = receivers[0]

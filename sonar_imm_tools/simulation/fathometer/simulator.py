@@ -98,7 +98,6 @@ def stamp_of(config: FathometerScenario, record: int) -> int:
 
 
 def _measurements(config: FathometerScenario, drift: Drift, rng: Generator) -> Iterator[list[Any]]:
-    """The measurements of each record."""
     for record in range(config.records):
         stated = None if config.depth_companion else float(drift.array_depth_stated[record])
         if config.level == 'pressure':

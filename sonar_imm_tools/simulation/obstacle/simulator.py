@@ -199,7 +199,10 @@ def simulate(config: ObstacleScenario, seed: int) -> Scene:
     """Run a scene. The same config and seed give the same scene; `truth` holds `TrueObstacle`."""
     rng = np.random.default_rng(seed)
     vehicle = _Vehicle(config, rng)
-    stamps = stamps_of(_ping_times(config, rng))
+    # Until the vehicle is `last_range` from the first obstacle.
+    step = 1.0 / config.ping_rate
+    even = np.arange(0.0, (config.first_range - config.last_range) / config.speed, step)
+    stamps = stamps_of(even + rng.uniform(-0.5, 0.5, len(even)) * config.ping_jitter * step)
     times: FloatArray = (stamps - FIRST_STAMP_NS).astype(np.float64) * 1e-9
     obstacles = paths(config, _places(config, vehicle, rng), vehicle.course, seed)
     stretch = 1.0 + config.sound_speed_error * rng.normal()
@@ -260,19 +263,6 @@ class _Vehicle:
         return geometry.mounted(self.pose(t), self.lever, self.mount)
 
 
-def _ping_times(config: ObstacleScenario, rng: Generator) -> FloatArray:
-    """Times of the pings, s, until the vehicle is `last_range` from the first obstacle."""
-    step = 1.0 / config.ping_rate
-    times = np.arange(0.0, (config.first_range - config.last_range) / config.speed, step)
-    return times + rng.uniform(-0.5, 0.5, len(times)) * config.ping_jitter * step
-
-
-def _seabed(config: ObstacleScenario, along: FloatArray) -> FloatArray:
-    """Depth of the sea floor `along` the course, m: ripples of the given relief."""
-    ripple = np.sin(2.0 * np.pi * along / 37.0) + 0.6 * np.sin(2.0 * np.pi * along / 13.0 + 1.0)
-    return config.depth + config.altitude + config.seabed_relief * ripple
-
-
 def _places(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> list[FloatArray]:
     """Positions of the obstacles, NED. The first one is `first_range` from the first ping, each
     further one `spacing` behind. The passing distance of each is drawn at random."""
@@ -300,7 +290,6 @@ def _offset(config: ObstacleScenario, number: int, depth: float, rng: Generator)
 
 
 def _navigate(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> list[Received]:
-    """Odometry by dead reckoning, and the altimeter."""
     last = (config.first_range - config.last_range) / config.speed + LEAD_IN
     t = np.arange(-LEAD_IN, last, 1.0 / config.navigation_rate)
     exact = 0.0 if config.ideal_navigation else 1.0
@@ -328,7 +317,10 @@ def _navigate(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> li
     turn = turned.as_rotvec() / (2.0 * _FINE)
     q = Rotation.from_matrix(geometry.flip_rotation(R)).as_quat()
     stamps = stamps_of(t + config.navigation_delay)
-    gaps = _gaps(config, t, rng)
+    gaps = np.zeros(len(t), bool)
+    if config.navigation_gaps > 0.0:
+        for start in rng.uniform(t[0], t[-1], rng.poisson(config.navigation_gaps)):
+            gaps |= (t >= start) & (t < start + config.navigation_gap)
     received = [
         Received(
             int(stamps[k]) + nanoseconds(config.navigation_latency),
@@ -345,7 +337,10 @@ def _navigate(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> li
         for k in np.flatnonzero(~gaps)
     ]
     every = max(1, round(config.navigation_rate / 2.0))
-    heights = _seabed(config, config.speed * t) - vehicle.position(t)[:, 2]
+    turns = 2.0 * np.pi * (config.speed * t)
+    ripple = np.sin(turns / 37.0) + 0.6 * np.sin(turns / 13.0 + 1.0)
+    seabed = config.depth + config.altitude + config.seabed_relief * ripple
+    heights = seabed - vehicle.position(t)[:, 2]
     heights = heights + config.altitude_std * rng.normal(size=len(t))
     received += [
         Received(
@@ -355,15 +350,6 @@ def _navigate(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> li
         if config.altimeter
     ]
     return received
-
-
-def _gaps(config: ObstacleScenario, t: FloatArray, rng: Generator) -> np.ndarray:
-    """True (n,) in the gaps of the navigation, of `navigation_gap` seconds each."""
-    silent = np.zeros(len(t), bool)
-    if config.navigation_gaps > 0.0:
-        for start in rng.uniform(t[0], t[-1], rng.poisson(config.navigation_gaps)):
-            silent |= (t >= start) & (t < start + config.navigation_gap)
-    return silent
 
 
 def _echoes(
@@ -448,6 +434,9 @@ def _truth(
 ) -> TrueObstacle:
     sonar, place = vehicle.sonar(times), path.at(times)
     d, azimuth = geometry.project(geometry.to_body(sonar, place), config.azimuth_model)
+    still = 'seabed' if config.placement == 'seabed' else 'fixed'
+    if path.sway is not None:
+        still = 'swaying'
     return TrueObstacle(
         track_id=number,
         stamp_ns=stamps,
@@ -457,12 +446,5 @@ def _truth(
         vertical_offset=place[:, 2] - sonar.position[:, 2],
         in_beam=_echoes(config, vehicle, times, path, 1.0)[1],
         velocity=geometry.flip_world(path.velocity(times))[:, :2],
-        does=_does(config, path, times),
+        does=np.where(path.moves(times), DOES.index('moving'), DOES.index(still)),
     )
-
-
-def _does(config: ObstacleScenario, path: Path, times: FloatArray) -> np.ndarray:
-    still = 'seabed' if config.placement == 'seabed' else 'fixed'
-    if path.sway is not None:
-        still = 'swaying'
-    return np.where(path.moves(times), DOES.index('moving'), DOES.index(still))
