@@ -74,13 +74,14 @@ class Picture(go.Figure):
         high: FloatArray,
         colour: str,
         opacity: tuple[float, float],
+        name: str | None = None,
         **further: Any,
     ) -> None:
         """Add the band between `low` and `high`; opacity: of the area and of its outline."""
         area, outline = (transparent(colour, each) for each in opacity)
         look = {'fill': 'toself', 'fillcolor': area, 'hoverinfo': 'skip'} | further
         x, y = np.concatenate([x, x[::-1]]), np.concatenate([low, high[::-1]])
-        self.line(x, y, None, outline, 0.5, **look)
+        self.line(x, y, name, outline, 0.5, **look)
 
     def image(
         self,
@@ -302,7 +303,8 @@ def _shapes(trace: Any, pixels: FloatArray) -> str:
 def _path(pixels: FloatArray) -> str:
     """Return the commands of a path that is broken at NaN."""
     parts, pen_up = [], True
-    for (x, y), drawn in zip(pixels, np.isfinite(pixels).all(axis=1)):
+    seen: Any = np.isfinite(pixels).all(axis=1)
+    for (x, y), drawn in zip(pixels, seen):
         if drawn:
             parts.append(f'{"M" if pen_up else "L"}{x:.1f} {y:.1f}')
         pen_up = not drawn
