@@ -120,8 +120,8 @@ def instruments_in(bag: Path, system: str) -> dict[str, dict[str, str] | None]:
     if len(found) == 1:
         return {'': None}
     return {
-        name: {topic: entry.name for topic, entry in inputs.items()}
-        for name, inputs in found.items()
+        instrument: {topic: entry.name for topic, entry in inputs.items()}
+        for instrument, inputs in found.items()
     }
 
 
@@ -153,32 +153,16 @@ def play_recording(
         origin=node.stated_origin(),
         detector=load_detector(SYSTEMS[system], used, {}),
     )
-    run = track_one(
-        Job(
-            bag=bag,
-            folder=folder / 'offline',
-            instrument='',
-            system=system,
-            config=config,
-            options=options,
-            overwrite=True,
-        ),
-        quiet,
-    )
+    made_of: dict[str, Any] = {'system': system, 'config': config, 'options': options}
+    run = track_one(Job(bag=bag, folder=folder / 'offline', overwrite=True, **made_of), quiet)
     if not live:
         return PlayedRecording(system, bag, folder, limit, (), {})
     with (
         progress('playing to the node', run['messages'], quiet=quiet) as advance,
         node_file(SYSTEMS[system], used) as given,
     ):
-        played = run_lockstep(
-            bag,
-            system,
-            params_file=given,
-            settings=config.as_dict(),
-            topics=topics,
-            progress=advance,
-        )
+        settings: dict[str, Any] = {'settings': config.as_dict(), 'topics': topics}
+        played = run_lockstep(bag, system, params_file=given, progress=advance, **settings)
     # In the same form as the offline run.
     with RunFolder(folder / 'live').fresh(overwrite=True) as live_folder:
         live_folder.write_estimates(final_estimates(played.estimates, config), system)

@@ -29,7 +29,7 @@ parameter; the least supported parameter is dropped until all have support. All 
 determined``: they keep their values, and the determined ones are fitted once more.
 
 The sums are exact (`math.fsum`), so that neither the order of recordings nor the number of
-processes changes a byte.
+processes changes a byte. In one file, since it is one estimate.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ class Job:
 
     bag: Path
     folder: Path
-    instrument: str
+    instrument: str = ''
     system: str
     config: Config
     options: InputOptions

@@ -22,7 +22,7 @@ compressed by zstd. A run is written elsewhere and moved to its folder when it i
 `sonar_imm.files`.
 
 Bag and tables hold nothing that depends on the time of the run: the same command writes the same
-bytes. Times and versions are in run.json.
+bytes. Times and versions are in run.json. In one file, since all of it is the layout of a folder.
 """
 
 from __future__ import annotations

@@ -12,7 +12,8 @@
 Nothing here uses the first-order formulas of `sonar_imm_tools.survey`, which it tests: poses are
 rotations, and sound goes in two straight pieces through two layers of water. The tracker is taken
 to know the speed of sound in the upper third of the column, where the array is, and to suppose the
-same below, where it is wrong. A correction is the true value less the reported one.
+same below, where it is wrong. A correction is the true value less the reported one. In one file,
+with the parameters, whose texts are a part of it.
 """
 
 from __future__ import annotations

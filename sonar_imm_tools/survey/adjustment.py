@@ -23,7 +23,8 @@ depth; along a line that goes with its gradients, and was taken for heading. Bes
     C = N^-1 (J' M V M J + J' M U S U' M J + P) N^-1,
 
 J the partials, M the weights after elimination, V the variances of looks, U the blocks with their
-budget S, P the prior information. The larger standard deviation of both is published.
+budget S, P the prior information. The larger standard deviation of both is published. In one file,
+since it is one estimate.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@
 
 A job is a line or a tile, see `jobs`. The statistics of lines and the products of tiles are put
 together in this process, in the order of names and numbers: which process did what, and when it
-ended, changes no byte.
+ended, changes no byte. In one file, from the first look at the folders to the last tile.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ moves (`ship`).
 One bin is y = sqrt(z) (s a(u) + n), the observation model of `acoustics.laplace`, or with noise
 that does not fade y = sqrt(z) s a(u) + n. Surface echoes fade with a z of their own. A spike is a
 strong burst of noise, incoherent across the array.
+In one file, since all of it draws from one generator in turn.
 """
 
 from __future__ import annotations

@@ -11,7 +11,8 @@
 A scenario (`SCENARIOS`) is a named choice of `motion`, how the divers move, and `sensor`, how they
 are observed. The paper's Table 1 gives start, speed, sampling and accuracy, but not the path. In
 `table1` the diver swims legs of 7 to 15 s whose headings lie within 85 degrees of a general
-heading ("zigzag with general consistent direction" in the paper).
+heading ("zigzag with general consistent direction" in the paper). In one
+file, since all of it draws from one generator in turn.
 """
 
 from __future__ import annotations

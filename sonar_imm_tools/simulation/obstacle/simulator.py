@@ -15,6 +15,7 @@ error and a bias, and from an attitude sensor with a bias. Obstacles are given b
 offset from the sonar, or as spheres on tethers, objects on the sea floor or floats at the surface.
 
 Measurements are in ROS axes, ENU and FLU; inside, all is NED and FRD as in the papers.
+In one file, since all of it draws from one generator in turn.
 """
 
 from __future__ import annotations
