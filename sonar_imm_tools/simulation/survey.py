@@ -154,10 +154,10 @@ def _plan(
     """The floor, start, course and length of each line, and the corrections (L, 6)."""
     width = (config.lines - 1) * config.spacing
     floor = _floor(config, width, rng)
-    starts = [
-        ((0.0, k * config.spacing), 0.0 if k % 2 == 0 else math.pi) for k in range(config.lines)
-    ]
-    lines = [((config.length if c else x, y), c, config.length) for (x, y), c in starts]
+    lines: list[tuple[tuple[float, float], float, float]] = []
+    for k in range(config.lines):  # there and back
+        start, course = (config.length, math.pi) if k % 2 else (0.0, 0.0)
+        lines.append(((start, k * config.spacing), course, config.length))
     for k in range(config.cross_lines):
         x = config.length * (k + 1) / (config.cross_lines + 1)
         lines.append(((x, -0.5 * config.spacing), 0.5 * math.pi, width + config.spacing))
@@ -346,11 +346,11 @@ def _line(
 ) -> Points:
     t = np.arange(0.0, length / config.speed, config.ping_interval)
     errors = budget()
-    slow = {
-        name: config.nav_errors * _slow(rng, t, SECONDS[name]) for name in ('heave', 'heading')
-    }
-    attitude = [config.nav_errors * _slow(rng, t, SECONDS['attitude']) for _ in range(2)]
-    position = [config.nav_errors * _slow(rng, t, SECONDS['position']) for _ in range(2)]
+    heave, heading, *others = (
+        config.nav_errors * _slow(rng, t, SECONDS[name])
+        for name in ('heave', 'heading', 'attitude', 'attitude', 'position', 'position')
+    )
+    attitude, position = others[:2], others[2:]
     roll = math.radians(2.0) * np.sin(2.0 * math.pi * t / 7.0 + rng.uniform(0.0, 6.0))
     pitch = math.radians(1.0) * np.sin(2.0 * math.pi * t / 5.5 + rng.uniform(0.0, 6.0))
     yaw = course + math.radians(0.8) * np.sin(2.0 * math.pi * t / 12.0 + rng.uniform(0.0, 6.0))
@@ -360,11 +360,11 @@ def _line(
     reported_place = place.copy()
     reported_place[:, :2] -= corrections[5] * config.speed * ahead
     reported_place[:, :2] -= errors.position * np.column_stack(position)
-    reported_place[:, 2] -= corrections[3] + errors.heave * slow['heave']
+    reported_place[:, 2] -= corrections[3] + errors.heave * heave
     reported = rotation(
         roll - corrections[0] - errors.attitude * attitude[0],
         pitch - corrections[1] - errors.attitude * attitude[1],
-        yaw - corrections[2] - errors.heading * slow['heading'],
+        yaw - corrections[2] - errors.heading * heading,
     )
     true = rotation(roll, pitch, yaw)
     # Beams evenly along the floor, on both sides.
@@ -380,9 +380,8 @@ def _line(
     own = _along_swath(rng, len(t), config.beams) * config.noise
     xyz[..., 2] += own
     D, Y = -slant * stated[..., 2], slant * np.hypot(stated[..., 0], stated[..., 1])
-    vertical, horizontal = uncertainties(
-        np.full(D.shape, config.noise**2), D, Y, errors, SOUND_SPEED
-    )
+    noise = np.full(D.shape, config.noise**2)
+    vertical, horizontal = uncertainties(noise, D, Y, errors, SOUND_SPEED)
     whole = np.broadcast_to(angle, D.shape)
     level = np.arccos(np.clip(-stated[..., 2], -1.0, 1.0)) * np.sign(whole)
     found = np.isfinite(xyz).all(axis=-1)

@@ -26,11 +26,10 @@ from collections.abc import Iterable, Mapping
 
 from attrs import evolve, frozen
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from sonar_imm.estimates import Estimate
-from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 from sonar_imm.estimation.consistency import identity_switches
 from sonar_imm.measurements import NOBODY
 
@@ -193,9 +192,9 @@ class Matching:
     beyond_row: IntArray
     beyond_truth: FloatArray
     scan_ns: IntArray
-    present: NDArray[np.bool_]
+    present: BoolArray
     followed_by: IntArray
-    scored: NDArray[np.bool_]
+    scored: BoolArray
 
     @property
     def error(self) -> FloatArray:

@@ -37,9 +37,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 from sonar_imm.estimation.consistency import identity_switches, interval_coverage
 from sonar_imm.measurements import Altitude, Measurement
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
@@ -104,7 +103,7 @@ def truth_consistency(found: Matching) -> dict[str, Any]:
     }
 
 
-def followed_by(found: Matching, obstacles: int) -> NDArray[np.int64]:
+def followed_by(found: Matching, obstacles: int) -> IntArray:
     """(pings, obstacles) id of the track on each obstacle, -1 without."""
     series = found.series
     followed = np.full((len(series.scan_ns), obstacles), -1, np.int64)
@@ -122,7 +121,7 @@ def above_calibration(found: Matching) -> dict[str, Any]:
 
 
 def binned(
-    stated: FloatArray, true: NDArray[np.bool_], edges: Sequence[float]
+    stated: FloatArray, true: BoolArray, edges: Sequence[float]
 ) -> dict[str, dict[str, float]]:
     """How often what was stated (m,) is true (m,), by ranges of the stated probability."""
     which = np.clip(np.searchsorted(edges, stated, side='right') - 1, 0, len(edges) - 2)
@@ -224,7 +223,7 @@ def behaviour_scores(found: Matching, truth: Sequence[TruePath]) -> dict[str, An
 
 def forecasts(
     found: Matching, truth: Sequence[TruePath], config: ObstacleConfig
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+) -> tuple[FloatArray, BoolArray]:
     """Stated probabilities (m,) of which the outcome is known, and whether it happened (m,)."""
     stated, came = [], []
     outcomes = [_outcomes(path, config) for path in truth]
@@ -237,7 +236,7 @@ def forecasts(
     return np.array(stated, float), np.array(came, bool)
 
 
-def forecast_scores(stated: FloatArray, came: NDArray[np.bool_]) -> dict[str, Any]:
+def forecast_scores(stated: FloatArray, came: BoolArray) -> dict[str, Any]:
     """Brier score and bins of forecasts (m,) and what came of them (m,)."""
     if not len(stated):
         return {}
@@ -272,7 +271,7 @@ def _outcomes(path: TruePath, config: ObstacleConfig) -> FloatArray:
     return outcome
 
 
-def _newest(found: Matching, truth: Sequence[TruePath]) -> NDArray[np.int64]:
+def _newest(found: Matching, truth: Sequence[TruePath]) -> IntArray:
     """Index into the obstacle's truth, the newest of each matched row (m,)."""
     stamps = found.series.stamp_ns[found.row]
     at = np.zeros(len(found.row), np.int64)

@@ -18,11 +18,10 @@ from collections.abc import Iterable
 
 from attrs import frozen
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.angles import wrap_angle
-from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS
 
@@ -86,7 +85,7 @@ class TruePath:
     track_id: int
     stamp_ns: IntArray
     seen: FloatArray
-    in_beam: NDArray[np.bool_]
+    in_beam: BoolArray
     velocity: FloatArray | None = None
     does: IntArray | None = None
 
@@ -100,7 +99,7 @@ class TruePath:
         between = before + fraction[:, None] * (self.seen[after] - before)
         return np.where(known[:, None], between, np.nan)
 
-    def there(self, stamp_ns: IntArray, gap: float) -> NDArray[np.bool_]:
+    def there(self, stamp_ns: IntArray, gap: float) -> BoolArray:
         """True (m,) where it should be tracked: in the beam for a while and not passed yet."""
         last = np.searchsorted(self.stamp_ns, stamp_ns, side='right') - 1
         seen = np.cumsum(self.in_beam)[np.maximum(last, 0)]

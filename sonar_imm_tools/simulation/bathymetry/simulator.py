@@ -203,7 +203,6 @@ SCENARIOS: Scenarios = {
         {'pings': 60, 'patch_drift': 0.2, 'patch_start': 32.0, 'patch_end': 42.0}),
 }
 # fmt: on
-"""Name: (what it is, what differs from the defaults of `BathymetryScenario`)."""
 
 scenario = BathymetryScenario.among(SCENARIOS)
 

@@ -195,7 +195,6 @@ SCENARIOS: Scenarios = {
         {'sensor': 'geodetic', 'speed': 0.75, 'random_rotation': True}),
 }
 # fmt: on
-"""Name: (what it is, what differs from the defaults of `DiverScenario`)."""
 
 scenario = DiverScenario.among(SCENARIOS)
 

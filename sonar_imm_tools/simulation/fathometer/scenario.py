@@ -20,10 +20,9 @@ from typing import Any
 from attrs import frozen
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from sonar_imm.acoustics.fathometer import PROCESSORS
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.parameters import parameter
 from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm.truth import PRESENT
@@ -203,7 +202,6 @@ SCENARIOS: Scenarios = {
          'fading': ()}),
 }
 # fmt: on
-"""Name: (what it is, what differs from the defaults of `FathometerScenario`)."""
 
 scenario = FathometerScenario.among(SCENARIOS)
 
@@ -216,7 +214,7 @@ class Drift:
 
     depth: FloatArray
     amplitude: FloatArray
-    present: NDArray[np.bool_]
+    present: BoolArray
     array_depth: FloatArray
     array_depth_stated: FloatArray
 

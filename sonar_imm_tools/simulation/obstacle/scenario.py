@@ -289,6 +289,5 @@ SCENARIOS: Scenarios = {
         {'late_fraction': 0.3, 'navigation_latency': 0.4, 'ping_jitter': 0.3}),
 }
 # fmt: on
-"""Name: (what it is, what differs from the defaults of `ObstacleScenario`)."""
 
 scenario = ObstacleScenario.among(SCENARIOS)
