@@ -220,6 +220,8 @@ class ObstacleScenario(Scenario):
         problems = super().check()
         if len(self.obstacle_speed) != 2 or self.obstacle_speed[0] > self.obstacle_speed[-1]:
             problems.append('obstacle_speed needs two values, the least and the greatest')
+        if self.last_range >= self.first_range:
+            problems.append('last_range must be less than first_range')
         if len(self.detection_profile) % 2:
             problems.append('detection_profile needs pairs of a range and a share')
         if self.images and self.ping_timing != 'instant':
