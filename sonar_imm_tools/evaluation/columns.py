@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_imm.estimates import Estimate
-from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.estimation.arrays import FloatArray, IndexArray, IntArray
 
 from ..recordings.sources import BagError
 
@@ -96,6 +96,11 @@ class Rows:
         """The same run with some of its rows (a mask, indices or a slice); `scan_ns` is kept."""
         names = ('stamp_ns', *_declared(type(self)))
         return evolve(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def spans(self, stamp_ns: IntArray) -> tuple[IndexArray, IndexArray]:
+        """First row (m,) of each stamp (m,), and one behind the last (m,)."""
+        first = np.searchsorted(self.stamp_ns, stamp_ns, side='left')
+        return first, np.searchsorted(self.stamp_ns, stamp_ns, side='right')
 
     def by_track(self: R) -> Iterator[tuple[int, R]]:
         """The rows of each ``track_id``; of several with one stamp the last counts."""

@@ -214,8 +214,7 @@ def match(series: Series, truth: Truth, *, cutoff: float) -> Matching:
     known = present.any(axis=0)
     one_to_one = len(truth) == 1 and len(np.unique(series.stamp_ns)) == len(series)
     limit = np.inf if one_to_one else cutoff
-    starts = np.searchsorted(series.stamp_ns, series.scan_ns, side='left')
-    ends = np.searchsorted(series.stamp_ns, series.scan_ns, side='right')
+    starts, ends = series.spans(series.scan_ns)
     followed_by = np.full(present.shape, -1, np.int64)
     near: list[tuple[np.integer, ...]] = []
     beyond: list[tuple[np.integer, ...]] = []

@@ -163,10 +163,8 @@ def match(series: Series, truth: tuple[TruePath, ...], *, cutoff: float, gap: fl
     there = np.array([path.there(pings, gap) for path in truth], bool)
     there = there.reshape(len(truth), len(pings))
     points, flat = level(series.state), level(seen)
-    starts = np.searchsorted(series.stamp_ns, pings, side='left')
-    ends = np.searchsorted(series.stamp_ns, pings, side='right')
     rows, targets, scores = [], [], []
-    for ping, (start, end) in enumerate(zip(starts, ends)):
+    for ping, (start, end) in enumerate(zip(*series.spans(pings))):
         if not np.isfinite(seen[:, ping]).any():
             continue
         who = np.flatnonzero(there[:, ping])
