@@ -33,7 +33,7 @@ from sonar_imm.files import marked
 from sonar_imm.parameters import ConfigError
 
 from ..evaluation.numbers import counted
-from ..offline.jobs import Run
+from ..offline.jobs import Calls, Run, Work
 from ..offline.run_folder import BAG, CSV, PARQUET, RUN, RunFolder, SOUNDINGS
 from ..offline.run_folder import KIND as RESULTS
 from ..recordings.export.points import origin_of, TOPIC, topics_of_soundings
@@ -241,6 +241,32 @@ class Progress:
     warn: Callable[[str], None]
 
 
+@frozen
+class _Jobs:
+    """What runs jobs and hears of them, and the folder where they keep what they make."""
+
+    run: Run
+    progress: Progress
+    work: Path
+
+    def all(self, work: Work, calls: Calls, what: str, named: Sequence[Any]) -> list[Any]:
+        """What came of all calls, in their order. Raises `BagError` naming the first that
+        failed."""
+        results: list[Any] = [None] * len(calls)
+        failures: dict[int, str] = {}
+        advance = self.progress.begin(what, len(calls))
+        for k, result, failure in self.run(work, calls):
+            results[k] = result
+            if failure:
+                failures[k] = failure
+            advance(1)
+        if failures:
+            k = min(failures)
+            why = f'{failures[k]}; --resume makes what is missing'
+            raise BagError(f'{what}: {named[k].name}: {why}')
+        return results
+
+
 @frozen(kw_only=True)
 class Survey:
     """What came of the jobs, for `products`. lines: as survey.json has them; tiles: in order, with
@@ -271,8 +297,9 @@ def make(
     sources: Sequence[Source], out: Path, options: Options, run: Run, progress: Progress
 ) -> Survey:
     """Do all jobs; out: the folder of the survey, whose ``.work`` they fill. Raises `BagError`."""
-    work = out / WORK
-    units, lines, budget = _imported(sources, work, options, run, progress)
+    jobs = _Jobs(run, progress, out / WORK)
+    work = jobs.work
+    units, lines, budget = _imported(sources, options, jobs)
     warnings = _unstated(sources, lines)
     for line in lines:
         if far := line['far']:
@@ -290,7 +317,7 @@ def make(
         folder = work / ('adjusted' if corrections.any() else 'looks')
         places = [folder / f'{unit.file.stem}.npy' for unit in units]
         calls = [(unit, corrections[unit.number], cell, p) for unit, p in zip(units, places)]
-        _all(run, line_statistics, calls, progress, 'statistics', units)
+        jobs.all(line_statistics, calls, 'statistics', units)
         return KeptLooks(places, cell)
 
     made_of = [unit.signature for unit in units], cell
@@ -321,7 +348,7 @@ def make(
     tiles = plan_tiles(looks, options.resolution)
     extent_of(tiles)
     corrections = none if found is None else found.corrections
-    files = _tiled(units, tiles, corrections, found, budget, rms, work, run, progress)
+    files = _tiled(units, tiles, corrections, found, budget, rms, jobs)
     for sentence in warnings:
         progress.warn(sentence)
     return Survey(
@@ -340,8 +367,9 @@ def make(
 
 
 def _imported(
-    sources: Sequence[Source], work: Path, options: Options, run: Run, progress: Progress
+    sources: Sequence[Source], options: Options, jobs: _Jobs
 ) -> tuple[list[Unit], list[dict[str, Any]], ErrorBudget]:
+    work, progress = jobs.work, jobs.progress
     digests = [hashlib.sha256(os.fsencode(source.name)).hexdigest() for source in sources]
     places = [work / 'lines' / digest[:16] for digest in digests]
     for folder in ('lines', 'looks', 'adjusted', 'soundings', 'tiles'):
@@ -350,7 +378,9 @@ def _imported(
     failures = [source.failure for source in sources]
     todo = [k for k, failure in enumerate(failures) if not failure]
     advance = progress.begin('lines', len(todo))
-    for n, info, failure in run(import_line, [(sources[k], places[k], options) for k in todo]):
+    for n, info, failure in jobs.run(
+        import_line, [(sources[k], places[k], options) for k in todo]
+    ):
         infos[todo[n]], failures[todo[n]] = info or {}, failure
         advance(1)
     units: list[Unit] = []
@@ -391,14 +421,13 @@ def _tiled(
     found: Adjustment | None,
     budget: ErrorBudget,
     rms: float,
-    work: Path,
-    run: Run,
-    progress: Progress,
+    jobs: _Jobs,
 ) -> dict[Tile, Path]:
     """The files of the tiles that hold soundings."""
+    work = jobs.work
     places = [work / 'soundings' / f'{unit.file.stem}.npy' for unit in units]
     calls = [(unit, corrections[unit.number], tiles, place) for unit, place in zip(units, places)]
-    rows = _all(run, tile_line, calls, progress, 'sorting', units)
+    rows = jobs.all(tile_line, calls, 'sorting', units)
     holders: dict[str, list[int]] = {}
     for k, ranges in enumerate(rows):
         for name in ranges:
@@ -407,36 +436,28 @@ def _tiled(
     tiles = [tile for tile in tiles if tile.name in holders]
     # What is not known of the mean speed of a line is among the corrections then.
     own = budget if found is None else evolve(budget, sound_speed=0.0)
-    jobs = []
+    left = rms if found is None else 0.0
+    made = []
     for tile in tiles:
         names = near[tile.name]
         numbers = sorted({k for name in names for k in holders.get(name, ())})
-        parts = [
-            (k, places[k], [rows[k][name] for name in names if name in rows[k]]) for k in numbers
-        ]
+        ranges = [[rows[k][name] for name in names if name in rows[k]] for k in numbers]
         covariance = None if found is None else found.of_lines(numbers)
-        jobs.append(
+        lines = [units[k].signature for k in numbers]
+        used = lines, ranges, corrections[numbers], asdict(own), covariance, left
+        made.append(
             TileJob(
                 tile=tile,
-                parts=parts,
-                signature=signed(
-                    __version__,
-                    tile.name,
-                    [units[k].signature for k in numbers],
-                    [part[2] for part in parts],
-                    corrections[numbers],
-                    asdict(own),
-                    covariance,
-                    0.0 if found is not None else rms,
-                ),
+                parts=[(k, places[k], each) for k, each in zip(numbers, ranges)],
+                signature=signed(__version__, tile.name, *used),
                 budget=own,
                 covariance=covariance,
-                crossing_rms=0.0 if found is not None else rms,
+                crossing_rms=left,
                 place=work / 'tiles' / f'{tile.name}.npz',
             )
         )
-    _all(run, make_tile, [(job,) for job in jobs], progress, 'tiles', tiles)
-    return {job.tile: job.place for job in jobs}
+    jobs.all(make_tile, [(job,) for job in made], 'tiles', tiles)
+    return {job.tile: job.place for job in made}
 
 
 def _neighbours(tiles: Sequence[Tile]) -> dict[str, list[str]]:
@@ -483,26 +504,3 @@ def _warnings_of(found: Adjustment) -> list[str]:
             'the array only: where the speed at the array is wrong too, beam angles are as well'
         )
     return warnings
-
-
-def _all(
-    run: Run,
-    work: Callable[..., Any],
-    calls: Sequence[tuple[Any, ...]],
-    progress: Progress,
-    what: str,
-    named: Sequence[Any],
-) -> list[Any]:
-    """What came of all calls, in their order. Raises `BagError` naming the first that failed."""
-    results: list[Any] = [None] * len(calls)
-    failures: dict[int, str] = {}
-    advance = progress.begin(what, len(calls))
-    for k, result, failure in run(work, calls):
-        results[k] = result
-        if failure:
-            failures[k] = failure
-        advance(1)
-    if failures:
-        k = min(failures)
-        raise BagError(f'{what}: {named[k].name}: {failures[k]}; --resume makes what is missing')
-    return results
