@@ -378,9 +378,8 @@ def _imported(
     failures = [source.failure for source in sources]
     todo = [k for k, failure in enumerate(failures) if not failure]
     advance = progress.begin('lines', len(todo))
-    for n, info, failure in jobs.run(
-        import_line, [(sources[k], places[k], options) for k in todo]
-    ):
+    calls = [(sources[k], places[k], options) for k in todo]
+    for n, info, failure in jobs.run(import_line, calls):
         infos[todo[n]], failures[todo[n]] = info or {}, failure
         advance(1)
     units: list[Unit] = []
