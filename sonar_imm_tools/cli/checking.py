@@ -93,8 +93,7 @@ def shipped_bags(system: str, scratch: Path) -> list[Path]:
     """The recordings of `system` that come with the package.
 
     An installation has the small ones only (setup.py): where it has none of a system, the first
-    is simulated into `scratch`. Raises FileNotFoundError if none is known, `BagError` without a
-    recipe.
+    is simulated into `scratch`. Raises FileNotFoundError for none, `BagError` without a recipe.
     """
     known = sorted(path for path in (share_folder() / 'bags').glob(f'{system}_*'))
     if not known:

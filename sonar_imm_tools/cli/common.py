@@ -45,8 +45,7 @@ OF_EVERY_NODE = ('use_sim_time', 'qos_overrides', 'start_type_description_servic
 
 
 def typed_overrides(config_type: type[Config], overrides: dict[str, str]) -> dict[str, Any]:
-    """Texts of ``--set`` in the types of the parameters. Others stay texts; Config refuses
-    them."""
+    """Texts of ``--set`` in the types of the parameters; of others texts, which Config refuses."""
     specs = specs_with(config_type, {}, overrides)
     return {name: _typed(text, specs.get(name)) for name, text in overrides.items()}
 
@@ -136,8 +135,7 @@ def _detector_specs(system: System) -> dict[str, ParameterSpec]:
 
 @contextlib.contextmanager
 def node_file(system: System, params: Path | OwnParameters | None) -> Iterator[Path | None]:
-    """Yields a parameter file for real nodes: `params`, of a recording's own one a copy of what is
-    taken from it."""
+    """Yields a parameter file for real nodes: `params`, of a recording's own one what is taken."""
     if not isinstance(params, OwnParameters):
         yield params
         return
@@ -178,8 +176,7 @@ def _parameters_of(
     needed: bool = True,
     report: bool = False,
 ) -> dict[str, Any]:
-    """What a file says for a node of `system`; needed: it is a mistake when it is for others
-    only."""
+    """What a file says for a node of `system`; needed: one for others only is a mistake."""
     if isinstance(path, OwnParameters):
         values = _taken(path, system, node_name, report)
     else:
@@ -219,8 +216,7 @@ def say(text: str = '', *, quiet: bool = False) -> None:
 
 
 def warn(text: str) -> None:
-    """Print one line on standard error. Names in it may hold anything, so only this and `say`
-    print sentences."""
+    """Print one line on standard error. Names may hold anything: only this and `say` print."""
     click.echo(visible(' '.join(text.split())), err=True)
 
 

@@ -168,8 +168,7 @@ def _export_map(asked: _Asked) -> Told:
 
 
 def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
-    """Longitude and latitude (n,) of places (n, 2 or 3) in metres from the origin; None where
-    nobody says it."""
+    """Longitude and latitude (n,) of places (n, 2 or 3) in metres; None where nobody says it."""
     if asked.epsg is None:
         return None
     import numpy as np

@@ -254,8 +254,7 @@ def say_parameters(bag: Path, plan: Plan, *, quiet: bool = False) -> None:
 def _of_all(
     plan: Plan, bags: Sequence[Path], out_dir: Path, shard: tuple[int, int]
 ) -> tuple[list[Job], list[Outcome]]:
-    """The runs that a share of `bags` takes, in the order of their paths, and what cannot be a
-    run."""
+    """The runs of a share of `bags`, in the order of their paths, and what cannot be a run."""
     from sonar_imm.parameters import ConfigError
 
     from ..offline.batch import Outcome

@@ -74,8 +74,7 @@ def column(*names: str, dtype: type = np.float64, default: float = np.nan) -> An
 
 
 def covariance_of(*names: str, prefix: str = 'cov') -> Any:
-    """A field (n, k, k) read from the upper triangle ``<prefix>_<a>_<b>`` of k `names`; NaN where
-    a column is missing."""
+    """A field (n, k, k) of the upper triangle ``<prefix>_<a>_<b>`` of `names`; NaN if missing."""
     return field(metadata={_COLUMNS: _Columns(names, prefix=prefix)})
 
 

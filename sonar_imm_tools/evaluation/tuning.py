@@ -284,8 +284,7 @@ def maximise(
 def errors(
     fitting: Fitting, best: FloatArray, evaluate: Callable[[list[FloatArray]], list[float]]
 ) -> FloatArray:
-    """Standard errors (p,) of the coordinates, from the curvature at `best`; infinite where it has
-    none."""
+    """Standard errors (p,) of the coordinates by the curvature at `best`; infinite without one."""
     p = len(best)
     step = np.diag([t.step for t in fitting.tunables])
     pairs = list(itertools.combinations(range(p), 2))

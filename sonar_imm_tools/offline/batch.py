@@ -78,8 +78,7 @@ class Job:
 
 @frozen(kw_only=True)
 class Outcome:
-    """What became of a job: its state, the content of run.json, or the sentence why there is
-    none."""
+    """What became of a job: its state, the content of run.json, or why there is none."""
 
     bag: Path
     folder: Path

@@ -54,8 +54,7 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
 
 def _fresh(count: int) -> ProcessPoolExecutor:
     """Processes that are no forks of this one: a fork copies the threads of a library half. On
-    Linux they are forks of one that has done nothing but load the libraries; those of macOS do not
-    outlive a fork."""
+    Linux they are forks of one that only loaded libraries; on macOS a fork does not live."""
     context = multiprocessing.get_context('forkserver' if sys.platform == 'linux' else 'spawn')
     if sys.platform == 'linux':
         context.set_forkserver_preload(LIBRARIES)
@@ -71,8 +70,7 @@ def _fresh(count: int) -> ProcessPoolExecutor:
 Work, Calls = Callable[..., Any], Sequence[tuple[Any, ...]]
 Ended = Iterator[tuple[int, Any, str]]
 Run = Callable[[Work, Calls], Ended]
-"""``run(work, calls)``: as they end, the number of each call, what came of it, and the sentence
-why nothing did."""
+"""``run(work, calls)``: as they end, the number of each call, what came of it, or why nothing."""
 
 
 @contextlib.contextmanager
@@ -190,9 +188,8 @@ async def _identity(address: str) -> dict[str, Any]:
 
 
 def as_they_end(client: Any, work: Work, calls: Calls) -> Ended:
-    """``work(*call)`` for each of `calls` on the workers of a dask client: the number of the call,
-    what came of it, and the sentence why nothing did. A worker may have died, or the scheduler be
-    gone."""
+    """``work(*call)`` for each of `calls` on the workers of a dask client, as `Run` has it. A
+    worker may have died, or the scheduler be gone."""
     from distributed import as_completed as ended
 
     futures = {client.submit(work, *call, pure=False): k for k, call in enumerate(calls)}

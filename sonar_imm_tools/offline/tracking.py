@@ -223,8 +223,7 @@ class OfflineRun:
         return made
 
     def read(self, advance: Callable[[int], None] = lambda count: None) -> Iterator[Received]:
-        """What the messages hold, in order: measurements and refusals. `advance` hears of each
-        message."""
+        """Measurements and refusals of the messages, in order; `advance` hears of each message."""
         for item in measurements_of(
             self.bag,
             self.system.name,
@@ -255,8 +254,7 @@ class OfflineRun:
             yield from self._admitted('--initial', late)
 
     def _admitted(self, topic: str, measurement: Any, first_ns: int = 0) -> Iterator[Any]:
-        """Yield a measurement, or a start as of `first_ns`, as the tracker is to have it; nothing
-        if it is refused."""
+        """Yield a measurement, or a start as of `first_ns`, for the tracker, if not refused."""
         try:
             if isinstance(measurement, Rejection):
                 raise measurement

@@ -35,8 +35,7 @@ _DEPTH = 50
 
 @frozen(eq=False)
 class ReceivedTable:
-    """One message of a table: its columns by name, (rows,) or (rows, count), or the sentence why
-    it is none."""
+    """One message of a table: columns by name, (rows,) or (rows, count), or why it is none."""
 
     topic: str
     stamp_ns: int = 0

@@ -174,9 +174,8 @@ class LockStep:
         self.follow(1, publisher.topic_name, sent)
 
     def follow(self, messages: int, topic: str, sent: float) -> None:
-        """Wait for the answers to `messages` that were published for the node because of what went
-        out on `topic` at `sent`, in seconds of `time.monotonic`. Raises `LinkError` without
-        one."""
+        """Wait for the answers to so many `messages`, published for the node because of what went
+        out on `topic` at `sent`, s of `time.monotonic`. Raises `LinkError` without one."""
         self._sent += messages
         if not self.wait_for(self._caught_up, ANSWER_LIMIT):
             raise LinkError(

@@ -6,8 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What the scenes of all systems share: how their parameters are named, when they begin, and noise
-that lasts."""
+"""What the scenes of all systems share: their parameters, when they begin, noise that lasts."""
 
 from __future__ import annotations
 
@@ -85,8 +84,7 @@ def lasting(white: FloatArray, keep: float) -> FloatArray:
 
 
 def smoothed(white: FloatArray, width: float) -> FloatArray:
-    """White noise (n, ...) of unit variance through a Gaussian kernel of `width` samples, with a
-    variance of one again."""
+    """White noise (n, ...) of unit variance, smoothed over `width` samples to unit variance."""
     impulse = np.zeros(len(white))
     impulse[len(white) // 2] = 1.0
     kernel = gaussian_filter1d(impulse, width, mode='wrap')

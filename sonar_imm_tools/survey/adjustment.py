@@ -145,8 +145,7 @@ class Adjustment:
 
 @frozen(eq=False)
 class Rounds:
-    """What the first R rounds have solved: the rms of looks before each (R,), and the unknowns
-    (P,) after the last."""
+    """What R rounds have solved: rms of looks before each (R,), unknowns (P,) after the last."""
 
     rms: FloatArray
     value: FloatArray
@@ -300,8 +299,7 @@ class Mistie:
 
 
 def misties(lines: Sequence[Looks]) -> tuple[dict[tuple[int, int], Mistie], int]:
-    """By the numbers of each pair of lines that share cells, first less second; and how many cells
-    two lines or more see."""
+    """By pairs of lines that share cells, first less second; how many cells several lines see."""
     keys, apart = [], []
     cells = 0
     for found in crossings(lines):
@@ -404,8 +402,7 @@ class _Equations:
         self.w = (NU + 1.0) / (NU + np.square(u)) / self.v
 
     def normal(self, J: csr_array) -> tuple[csc_array, FloatArray]:
-        """Information (k, k) and right-hand side (k,) of the unknowns of J, heights of cells
-        eliminated."""
+        """Information (k, k) and right-hand side (k,) for J, heights of cells eliminated."""
         WJ = diags_array(self.w) @ J
         K = (self.in_cell @ WJ).tocsr()
         weight = self.in_cell @ self.w
@@ -448,8 +445,7 @@ class _Equations:
         return hstack([self.J, columns]).tocsr(), np.concatenate([prior, information])
 
     def solve(self, states: bool, start: FloatArray) -> FloatArray:
-        """The unknowns (P,), by iterated Student weights, from those of the round before; 0 in the
-        first one."""
+        """The unknowns (P,), by iterated Student weights, from those of the round before or 0."""
         J, prior = self._system(states)
         size = len(start)
         value = np.concatenate([start, np.zeros(len(prior) - size)])

@@ -217,8 +217,7 @@ def plan_tiles(lines: Sequence[Looks], resolution: float) -> list[Tile]:
 
 
 def extent_of(tiles: Sequence[Tile]) -> tuple[float, float, float, int, int]:
-    """West, north, finest cell, rows and columns of the chart of tiles. Raises `BagError` for too
-    many cells."""
+    """West, north, finest cell, rows, columns of a chart. Raises `BagError` for too many cells."""
     cell = min(tile.cell for tile in tiles)
     corners = np.array([[t.i, t.j, t.i + 1, t.j + 1] for t in tiles]) * TILE
     corners = corners * np.array([[t.cell] for t in tiles])
@@ -250,8 +249,7 @@ class _Jobs:
     work: Path
 
     def all(self, work: Work, calls: Calls, what: str, named: Sequence[Any]) -> list[Any]:
-        """What came of all calls, in their order. Raises `BagError` naming the first that
-        failed."""
+        """What came of all calls, in order. Raises `BagError` naming the first that failed."""
         results: list[Any] = [None] * len(calls)
         failures: dict[int, str] = {}
         advance = self.progress.begin(what, len(calls))

@@ -6,8 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The files of a survey: charts, provenance, coverage, the adjustment, where lines cross, and a
-page that shows them."""
+"""The files of a survey: charts, provenance, coverage, adjustment, crossings, and their page."""
 
 from __future__ import annotations
 
@@ -136,8 +135,7 @@ def _is_survey(out: Path) -> bool:
 
 
 def write(survey: Survey, out: Path) -> dict[str, Any]:
-    """Write all files; gives the content of survey.json, which is the last of them. Raises
-    `BagError`."""
+    """Write all files; gives the content of survey.json, the last of them. Raises `BagError`."""
     counts = {tile: len(nodes.z) for tile, nodes in survey.nodes()}
     west, north, cell, rows, columns = extent_of(list(counts))
     bands = {name: np.full((rows, columns), np.nan, np.float32) for name in OF_A_SURVEY}

@@ -248,8 +248,7 @@ def outlines(mean: FloatArray, covariance: FloatArray, *, probability: float = 0
 def headings_together(
     names: tuple[str, ...], probabilities: FloatArray
 ) -> tuple[tuple[str, ...], FloatArray]:
-    """Models and their probabilities (n, M), those of the families `steady` and `brisk` with the
-    same heading added up."""
+    """Models and their probabilities (n, M), the same heading of `steady` and `brisk` added up."""
     short = [name.removeprefix('steady_').removeprefix('brisk_') for name in names]
     first = tuple(dict.fromkeys(short))
     added = np.array([[name == each for each in first] for name in short], float)

@@ -70,8 +70,7 @@ class Series(Rows):
         return self.pick(np.isfinite(self.nis) & (self.nis_dof > 0))
 
     def name(self, track_id: int, names: Mapping[str, str]) -> str:
-        """Return what a track is called: by the name of its target, if it has one. names: of
-        targets by target ID."""
+        """Return what a track is called, by its target where `names` (by target ID) has it."""
         own = self.target_id[self.track_id == track_id]
         found = [names[key] for key in map(str, own[::-1].tolist()) if key in names]
         return f'{found[0]} (track {track_id})' if found else f'track {track_id}'
@@ -151,8 +150,7 @@ class Truth:
         return len(self.paths)
 
     def shifted(self, lag: float) -> Truth:
-        """The truth shifted by `lag` seconds: estimates at t are compared with truth at t +
-        lag."""
+        """The truth `lag` seconds earlier: estimates at t are compared with truth at t + lag."""
         shift = round(lag * SECOND)
         paths = (evolve(path, stamp_ns=path.stamp_ns - shift) for path in self.paths)
         return evolve(self, paths=tuple(paths))

@@ -164,8 +164,7 @@ def ship_of(config: ShipScenario, sonar_depth: float, rng: Generator) -> Ship:
 def navigation_of(
     config: ShipScenario, ship: Ship, first_ns: int, seconds: float, rng: Generator, frame_id: str
 ) -> list[Navigation]:
-    """What the ship's navigation says from a second before time zero, at `first_ns`, to a second
-    after `seconds`."""
+    """The navigation from a second before time zero, at `first_ns`, to one after `seconds`."""
     count = math.ceil((seconds + _BEFORE + _AFTER) * config.nav_rate) + 1
     t = np.arange(count) / config.nav_rate - _BEFORE
     scale = np.array(
@@ -255,8 +254,7 @@ def sine_from(look: sounding.Looks, s: FloatArray) -> FloatArray:
 def _launch(
     config: ShipScenario, array_z: FloatArray, z: FloatArray, ranges: FloatArray, tau: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Sine (T,) of the elevation at which rays leave for floors at `z`, how far outward they get,
-    and whether they do."""
+    """Sines (T,) of elevation of rays to floors at `z`, how far they get, whether they do."""
     if not config.sound_speed_profile:
         s = (array_z - z) / ranges
         distance = np.sqrt(np.maximum(ranges**2 - (array_z - z) ** 2, 0.0))

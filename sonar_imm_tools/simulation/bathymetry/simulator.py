@@ -452,8 +452,7 @@ def _of_facets(
 
 
 def _echo(config: BathymetryScenario, sine: FloatArray, rng: Generator) -> ComplexArray:
-    """Plane waves (n, P) of unit power from direction sines (n,), less what differs from stave to
-    stave."""
+    """Plane waves (n, P) of unit power from direction sines (n,), less what staves differ in."""
     shape = config.staves, config.spacing_wavelengths
     vectors = array.steering(sine, *shape, conjugate=config.conjugate)
     share = config.decorrelation

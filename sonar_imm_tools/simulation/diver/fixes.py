@@ -104,8 +104,7 @@ def instruments_of_places(config: Any) -> dict[str, Any]:
 
 
 def namespace_of(measurement: Any) -> str:
-    """A transponder's positions have a topic for each diver: their message has no room for the
-    number."""
+    """A topic for each diver with a transponder: their message has no room for the number."""
     return f'diver_{measurement.target_id}' if isinstance(measurement, RelativeFix) else ''
 
 

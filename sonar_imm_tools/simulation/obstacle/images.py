@@ -209,8 +209,7 @@ def image_pings(
 
 
 def vertical_pattern(elevation: FloatArray, width: float) -> FloatArray:
-    """Power received from `elevation` rad, out and back, by a beam `width` rad high (-3 dB, one
-    way); Gaussian."""
+    """Power from `elevation` rad, out and back, in a Gaussian beam `width` rad high (-3 dB)."""
     return np.exp(-8.0 * np.log(2.0) * np.square(elevation / width))
 
 
