@@ -84,9 +84,8 @@ class PlayedRecording:
         judgement = evaluate_run(self.folder / 'offline')
         accuracy = judgement.accuracy(self.limit)
         checks = self.checks if accuracy is None else (*self.checks, accuracy)
-        return CheckedRecording(
-            self.system, self.bag, self.folder, checks, self.latency_ms, judgement
-        )
+        where = self.system, self.bag, self.folder
+        return CheckedRecording(*where, checks, self.latency_ms, judgement)
 
 
 def shipped_bags(system: str, scratch: Path) -> list[Path]:

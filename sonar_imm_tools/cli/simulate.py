@@ -80,23 +80,21 @@ def command(
         sections[FEEDERS[system]] = {'input_types': ['image=sensor_msgs/msg/Image'], **fed}
     notes = {'source': f'simulated: {system} {name}', 'seed': str(seed), 'sonar_imm': __version__}
     notes |= {f'set {key}': value for key, value in sorted(overrides.items())}
-    report = write_scene(
-        scene, out_bag, compressed=compress, parameters=sections, provenance=notes
-    )
+    made = write_scene(scene, out_bag, compressed=compress, parameters=sections, provenance=notes)
     parameters = own_parameters(out_bag)
     targets = sum(isinstance(true, TrueTrack) for true in scene.truth)
     result = {
         'bag': str(out_bag),
         'scenario': name,
         'seed': seed,
-        'messages': report.messages,
+        'messages': made.messages,
         'targets': targets,
         'parameters': known,
     }
     if as_json:
         print_json(result)
         return
-    what = by_topic(report.messages)
+    what = by_topic(made.messages)
     say(f'{out_bag}: {what} ({name}, seed {seed}' + (f', {targets} targets)' if targets else ')'))
     if parameters:
         say(f'  parameters of the instruments, for the tracker: {parameters}')

@@ -132,9 +132,8 @@ def read_rows(kind: type[R], estimates: Iterable[Estimate], missing: str, **furt
 def read_columns(table: Estimate, names: Iterable[str], missing: str) -> dict[str, FloatArray]:
     """The columns `names` of one table, each (n,). Raises `MissingColumn` as `read_rows` does."""
     columns = table.columns()
-    return {
-        name.rstrip('?'): _Columns((name,)).read(columns, len(table), missing) for name in names
-    }
+    read = {name.rstrip('?'): _Columns((name,)).read for name in names}
+    return {name: values(columns, len(table), missing) for name, values in read.items()}
 
 
 def _declared(kind: type[Rows]) -> dict[str, _Columns]:

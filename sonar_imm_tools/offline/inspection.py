@@ -133,9 +133,7 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
     """The tracker inputs that a message could be for."""
     found = []
     for system in SYSTEMS:
-        fitting = [
-            entry for entry in every_input(system) if entry.may_be(item.topic, item.type_name)
-        ]
+        fitting = [each for each in every_input(system) if each.may_be(item.topic, item.type_name)]
         # Of several inputs that a name says, the later one counts, as in `fitting_topics`.
         named = [entry for entry in fitting if entry.is_named(item.topic)][-1:]
         found += [(system, entry) for entry in named or fitting]
@@ -254,9 +252,8 @@ def _systems(
     systems: dict[str, Inputs] = {}
     options: dict[str, dict[str, str]] = {}
     for system in fitting_systems(bag):
-        named = {
-            entry.name for each in instruments(bag, system).values() for entry in each.values()
-        }
+        every = instruments(bag, system).values()
+        named = {entry.name for inputs in every for entry in inputs.values()}
         if _enough(system, named & found.get(system, {}).keys()):
             systems[system], options[system] = found[system], {}
     taken = {

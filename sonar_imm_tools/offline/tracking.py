@@ -367,17 +367,15 @@ def write_run(
         'topics': json.dumps(offline.topics),
         'parameters': json.dumps(finite(recipe['parameters'])),
     }
-    written = folder.write_estimates(
-        offline.estimates(advance), system, tables=tables, notes=notes
-    )
-    if not written['estimates'] and (failure := offline.failure()):
+    made = folder.write_estimates(offline.estimates(advance), system, tables=tables, notes=notes)
+    if not made['estimates'] and (failure := offline.failure()):
         raise BagError(f'{path}: {failure}')
     seconds = time.perf_counter() - begin
     run = run_record(
         bag=str(path.resolve()),
         **recipe,
         messages=offline.messages,
-        **written,
+        **made,
         written_bytes=sum(f.stat().st_size for f in folder.path.rglob('*') if f.is_file()),
         counts=offline.outcomes(),
         refused={reason: asdict(entry) for reason, entry in sorted(offline.refused.items())},

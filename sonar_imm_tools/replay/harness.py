@@ -130,10 +130,8 @@ def run_lockstep(
         exit_code, log = node.stop(), node.log()
         if before is not None:
             exit_code, log = before.stop() or exit_code, log + before.log()
-        result = player.result()
-        return LockstepResult(
-            recorder.estimates(), lockstep.counts, result.delays, exit_code, log, result.problems
-        )
+        played, made = player.result(), (recorder.estimates(), lockstep.counts)
+        return LockstepResult(*made, played.delays, exit_code, log, played.problems)
 
 
 class NodeProcess:

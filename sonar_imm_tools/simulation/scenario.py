@@ -88,6 +88,5 @@ def smoothed(white: FloatArray, width: float) -> FloatArray:
     impulse = np.zeros(len(white))
     impulse[len(white) // 2] = 1.0
     kernel = gaussian_filter1d(impulse, width, mode='wrap')
-    return np.asarray(
-        gaussian_filter1d(white, width, axis=0, mode='wrap') / np.linalg.norm(kernel)
-    )
+    smooth = gaussian_filter1d(white, width, axis=0, mode='wrap')
+    return np.asarray(smooth / np.linalg.norm(kernel))

@@ -318,12 +318,11 @@ def make(
         jobs.all(line_statistics, calls, 'statistics', units)
         return KeptLooks(places, cell)
 
-    made_of = [unit.signature for unit in units], cell
+    made_of: tuple[Any, ...] = ([unit.signature for unit in units], cell)
     none = np.zeros((len(units), 6))
     looks = statistics(none)
-    before, cells, rms = find_misties(
-        looks, made_of, work / 'misties.json', rms=not options.adjusted
-    )
+    place = work / 'misties.json'
+    before, cells, rms = find_misties(looks, made_of, place, rms=not options.adjusted)
     found: Adjustment | None = None
     after: Misties = {}
 
@@ -339,9 +338,8 @@ def make(
             raise BagError(f'the lines cannot be adjusted: {error}') from None
         warnings += _warnings_of(found)
         looks = statistics(found.corrections)
-        after, _, _ = find_misties(
-            looks, (*made_of, found.corrections), work / 'adjusted_misties.json'
-        )
+        place, made_of = work / 'adjusted_misties.json', (*made_of, found.corrections)
+        after, _, _ = find_misties(looks, made_of, place)
         rms = found.rms[0]
     tiles = plan_tiles(looks, options.resolution)
     extent_of(tiles)

@@ -189,15 +189,13 @@ def mistie_figure(metrics: Mapping[str, Any]) -> Picture:
             shown = [h for h in crossing['horizons'] if h['judged'] == judged]
             if not shown:
                 continue
-            kinds = [
-                'floor' if h['bottom'] else 'multiple' if h['multiple'] else '' for h in shown
-            ]
+            what = ['floor' if h['bottom'] else 'multiple' if h['multiple'] else '' for h in shown]
             depths = [0.5 * (h['depth_a_m'] + h['depth_b_m']) for h in shown]
             colour = COLOURS[(number - 1) % len(COLOURS)]
             symbol = 'circle' if judged else 'circle-open'
             figure.add_scatter(
                 x=[h['difference_m'] for h in shown],
-                y=[f'{kind} {depth:.1f} m ({number})' for kind, depth in zip(kinds, depths)],
+                y=[f'{kind} {depth:.1f} m ({number})' for kind, depth in zip(what, depths)],
                 error_x={'array': [2.0 * h['std_m'] for h in shown], 'color': colour},
                 mode='markers',
                 marker={'color': colour, 'size': 9, 'symbol': symbol},
