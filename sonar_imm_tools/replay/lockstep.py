@@ -145,14 +145,8 @@ class LockStep:
 
         def connected() -> object:
             nonlocal last
-            heard = {
-                p.topic_name
-                for p in publishers
-                for info in node.get_subscriptions_info_by_topic(p.topic_name)
-                if _full_name(info) == self._name
-            }
-            if heard - hearing:
-                hearing.update(heard)
+            if fresh := self._subscribed(publishers) - hearing:
+                hearing.update(fresh)
                 last = time.monotonic()
             return (
                 bool(hearing)
@@ -232,6 +226,15 @@ class LockStep:
         if not self._link.node.count_publishers(self._name + _ANSWERS):
             return f"node '{self._name}' has gone"
         return None
+
+    def _subscribed(self, publishers: list[Publisher]) -> set[str]:
+        """Topics among those of `publishers` that the node itself subscribes to."""
+        return {
+            p.topic_name
+            for p in publishers
+            for info in self._link.node.get_subscriptions_info_by_topic(p.topic_name)
+            if _full_name(info) == self._name
+        }
 
     def _silence(self, publishers: list[Publisher], hearing: set[str]) -> str:
         """Say why no topic of the bag reaches the node."""
