@@ -105,10 +105,10 @@ def test_a_truth_bag_without_truth_is_told(tmp_path):
 
 @pytest.mark.parametrize('system', ['diver', 'obstacle'])
 def test_truth_that_is_none_is_refused_by_the_name_of_its_recording(system, tmp_path, monkeypatch):
-    module = import_module(f'sonar_imm_tools.evaluation.{system}')
     place = {name: np.zeros(1, np.float32) for name in 'xyz'}
     nothing = Estimate.from_columns(place, stamp_ns=1, frame_id='map')
-    monkeypatch.setattr(module, 'read_truth', lambda *_: [nothing])
+    read_truth = 'sonar_imm_tools.evaluation.judging.read_truth'
+    monkeypatch.setattr(read_truth, lambda *_: [nothing])
     with pytest.raises(BagError, match=re.escape(f'{tmp_path / "dive"}: ')):
         judge(folder_of(tmp_path, system=system))
 
