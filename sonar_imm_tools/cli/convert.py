@@ -91,7 +91,7 @@ def _add_subcommand(kind: str, options: type) -> None:
         print_json(_described(report)) if as_json else _print(report)
 
     examples = (f'sonar-imm convert {kind} {line}' for line in options.EXAMPLES)  # type: ignore[attr-defined]
-    about = {'help': inspect.getdoc(options), 'epilog': opt.example(*examples)}
+    about: dict[str, Any] = {'help': inspect.getdoc(options), 'epilog': opt.example(*examples)}
     subcommand = click.Command(kind, callback=run, **about)
     click.argument('source', metavar='IN', type=opt.PATH)(subcommand)
     click.argument('out_bag', type=opt.PATH, required=False)(subcommand)

@@ -67,7 +67,8 @@ def _fresh(count: int) -> ProcessPoolExecutor:
         ) from None
 
 
-Work, Calls = Callable[..., Any], Sequence[tuple[Any, ...]]
+Work = Callable[..., Any]
+Calls = Sequence[tuple[Any, ...]]
 Ended = Iterator[tuple[int, Any, str]]
 Run = Callable[[Work, Calls], Ended]
 """``run(work, calls)``: as they end, the number of each call, what came of it, or why nothing."""

@@ -321,8 +321,8 @@ def misties(lines: Sequence[Looks]) -> tuple[dict[tuple[int, int], Mistie], int]
     starts, _, _ = runs_of(key[order])
     pairs = [divmod(pair, 1 << 32) for pair in key[order[starts]].tolist()]
     each = np.split(d[order], starts[1:])
-    found = (Mistie(len(own), float(np.median(own)), robust_rms(own)) for own in each)
-    return dict(zip(pairs, found)), cells
+    made = (Mistie(len(own), float(np.median(own)), robust_rms(own)) for own in each)
+    return dict(zip(pairs, made)), cells
 
 
 def robust_rms(values: FloatArray) -> float:

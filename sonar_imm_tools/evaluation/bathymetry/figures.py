@@ -242,8 +242,8 @@ def segmentation_figure(swath: Swath) -> Picture:
     )
     ends = [(x, y) for each, y in zip(profiles, seconds) for x in chain(*_patches(each))]
     if ends:
-        look = {'symbol': 'line-ns-open'}
-        figure.points(*np.array(ends).T, 'ends of the true patch', COLOURS[1], 6, **look)
+        (x, y), name = np.array(ends).T, 'ends of the true patch'
+        figure.points(x, y, name, COLOURS[1], 6, symbol='line-ns-open')
     return figure.styled(340, SLANT | BARE, {'title': 'time [s]', 'autorange': 'reversed'} | BARE)
 
 

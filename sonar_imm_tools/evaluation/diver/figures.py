@@ -153,15 +153,17 @@ def map_figure(
 def _add_track(figure: Picture, track: Series, order: int, name: str) -> None:
     colour = COLOURS[order % len(COLOURS)]
     x, y = outlines(track.state[:, :2], track.covariance[:, :2, :2]).T
-    area = {'fill': 'toself', 'fillcolor': transparent(colour, 0.10), 'hoverinfo': 'skip'}
     group: dict[str, Any] = {'legendgroup': name, 'showlegend': False}
-    figure.line(x, y, None, transparent(colour, 0.35), 1, **group, **area)
+    fill = transparent(colour, 0.10)
+    area = group | {'fill': 'toself', 'fillcolor': fill, 'hoverinfo': 'skip'}
+    figure.line(x, y, None, transparent(colour, 0.35), 1, **area)
     track = track.pick(thin(len(track), MOST_POINTS))
     shown = group | {'showlegend': order < MOST_TRACKS_NAMED, 'mode': 'lines+markers'}
     time = seconds(track.stamp_ns, track.scan_ns)
     hover = '%{customdata:.1f} s: x %{x:.2f}, y %{y:.2f}'
-    more = {'marker': {'size': 4}, 'customdata': time, 'hovertemplate': hover}
-    figure.line(*track.state[:, :2].T, name, colour, **shown, **more)
+    shown |= {'marker': {'size': 4}, 'customdata': time, 'hovertemplate': hover}
+    x, y = track.state[:, :2].T
+    figure.line(x, y, name, colour, **shown)
 
 
 def error_figure(matching: Matching, track_id: int) -> Picture:

@@ -100,9 +100,10 @@ def response_figure(image: Image | None, records: Sequence[Record], start_ns: in
     if image is not None:
         image = _thinned(image)
         most = float(max(6.0, np.nanpercentile(image.value, 99.7)))
-        time, look = (image.stamp_ns - start_ns) / SECOND, {'showscale': True, 'hoverinfo': 'skip'}
-        of = {'title': 'response / noise', 'limits': (0.0, most), 'colours': 'Greys'}
-        figure.image(time, image.depth, np.round(image.value, 2), **of, **look)
+        look: dict[str, Any] = {'title': 'response / noise', 'limits': (0.0, most)}
+        look |= {'colours': 'Greys', 'showscale': True, 'hoverinfo': 'skip'}
+        time = (image.stamp_ns - start_ns) / SECOND
+        figure.image(time, image.depth, np.round(image.value, 2), **look)
     _add_truth(figure, records, lambda true: true.depth, start_ns, 'truth')
     _add_tracks(figure, records, 'depth', start_ns, mode='lines+markers', marker={'size': 4})
     y = {'title': 'depth [m]', 'autorange': 'reversed', 'showgrid': False}
