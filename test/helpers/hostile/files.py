@@ -126,29 +126,28 @@ def states_damaged(recording, draws, first=0):
         header, arrays = parts_of(path)
         text = json.dumps(header)
         for k in range(first, first + draws):
-            rng = np.random.default_rng(k)
+            rng, wrong = np.random.default_rng(k), []
             if k % 4:
                 forge(path, *forged(text, arrays, rng))
             else:
                 path.write_bytes(damaged(good, rng))
-            start, problem = process_time(), ''
+            start = process_time()
             try:
                 tracker = tracker_from(read_state(path), run.system, run.config)
                 taken += 1
                 if not k % 4 and path.read_bytes() != good:
-                    problem = 'damaged, and taken for good'
+                    wrong.append('damaged, and taken for good')
                 with contextlib.suppress(Exception):
                     for measurement in run.input[CUT : CUT + GOES_ON]:
                         tracker.process(measurement)
             except StateError as error:
                 if '\n' in str(error) or len(str(error)) > MOST_WORDS:
-                    problem = repr(str(error)[:100])
+                    wrong.append(repr(str(error)[:100]))
             except Exception as error:
-                problem = f'{type(error).__name__}: {error}'
+                wrong.append(f'{type(error).__name__}: {error}')
             if process_time() - start > LONGEST:
-                problem = f'{process_time() - start:.0f} s'
-            if problem:
-                failures.append(f'state of {run.system.name}, draw {k}: {problem}')
+                wrong.append(f'{process_time() - start:.0f} s')
+            failures += [f'state of {run.system.name}, draw {k}: {each}' for each in wrong]
     return taken, failures
 
 
@@ -167,9 +166,7 @@ def state_results(recording, draws, first):
     return _results(name, draws, states_damaged, recording, draws, first)
 
 
-def _results(name, draws, attempt, *what):
-    start = process_time()
-    used, failures = attempt(*what)
-    seconds = round(process_time() - start, 1)
-    told = {'name': name, 'draws': draws, 'used': used, 'failures': failures[:5]}
-    return {**told, 'cpu_seconds': seconds}
+def _results(name, draws, attempt, *arguments):
+    start, (used, failures) = process_time(), attempt(*arguments)
+    found = {'name': name, 'draws': draws, 'used': used, 'failures': failures[:5]}
+    return {**found, 'cpu_seconds': round(process_time() - start, 1)}
