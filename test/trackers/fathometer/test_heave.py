@@ -55,9 +55,7 @@ def kalman(seen, layers, depth_std, memory, lag=0):
     seen up to `lag` records later: all of it is jointly Gaussian."""
     records, std = np.arange(len(seen)), 0.5
     walk = 1e4 + depth_std**2 / layers * np.minimum.outer(records, records)
-    shift = std**2 * np.where(np.eye(len(seen)) > 0, 1.0, 0.0)
-    if memory:
-        shift = std**2 * memory ** np.abs(np.subtract.outer(records, records))
+    shift = std**2 * memory ** np.abs(np.subtract.outer(records, records))
     found, off = [], np.array(seen) - seen[0]
     for k in range(len(seen) - lag):
         upto = slice(0, k + lag + 1)
