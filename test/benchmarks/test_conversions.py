@@ -6,12 +6,14 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The files of the study of conversions, written byte by byte, hold what the converters find."""
+"""The files of the study of conversions, written byte by byte, hold what the converters find; and
+the recordings of others that only the studies read."""
 
 import numpy as np
 import pytest
 
 from benchmarks import conversions
+from benchmarks.recordings import autoferry, DATA, scans_of, truth_of
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
@@ -61,3 +63,48 @@ def test_an_xtf_of_bytes_lies_where_it_says(tmp_path):
     poses = [each for each in found if type(each).__name__ == 'Navigation']
     assert poses[-1].position[:2] == pytest.approx([0.0, 11e-6 * 111_314.0], abs=1e-3)
     assert poses[-1].stamp_ns - poses[0].stamp_ns == 2_200_000_000
+
+
+def record(time, measurement, sensor=2):
+    place = {'ownshipPosition': [100.0, 200.0]}
+    return {'sensorID': sensor, 'time': time, 'measurement': measurement, **place}
+
+
+def test_detections_become_scans_east_first():
+    records = [
+        record(9.0, [5.0, -6.0]), record(3.0, [[1.0, 2.0, 3.0], [10.0, 20.0, 30.0]]),
+        record(4.0, []), record(5.0, [0.1, 0.2, 0.3], sensor=4),
+    ]  # fmt: skip
+    scans = scans_of(records, 'radar', -1_500_000_000)
+    assert [scan.stamp_ns for scan in scans] == [1_500_000_000, 2_500_000_000, 7_500_000_000]
+    assert [scan.position.tolist() for scan in scans] == [
+        [[210.0, 101.0, 0.0], [220.0, 102.0, 0.0], [230.0, 103.0, 0.0]], [],
+        [[194.0, 105.0, 0.0]],
+    ]  # fmt: skip
+    assert not scans_of(records, 'lidar')
+
+
+def test_truth_is_sorted_and_told_once():
+    one = {'targetID': 1, 'position': [1.0, 2.0, 5.0], 'time': 3.0}
+    groups = [[{'targetID': 2, 'position': [7.0, 8.0, 0.0], 'time': 3.5}, one], [one]]
+    due = np.array([[3.0, 1.0, 2.0, 1.0], [3.5, 2.0, 8.0, 7.0]])
+    assert truth_of(groups) == pytest.approx(due)
+
+
+@pytest.mark.skipif(
+    not DATA.is_dir(), reason='no real recordings here; SONAR_IMM_DATA names their folder'
+)
+def test_the_real_scenario_lies_around_its_truth():
+    scans, truth = autoferry('radar')
+    assert len(truth) == 1152 + 575
+    filled = sum(len(scan) > 0 for scan in scans)
+    assert filled == 68 and len(scans) > filled  # some scans saw nothing
+    assert sum(map(len, scans)) > 2 * filled  # clutter besides the boats
+    for number in (1, 2):
+        path = truth[truth[:, 1] == number]
+        near = [
+            np.hypot(*(place[:2] - [np.interp(stamp, path[:, 0], path[:, c]) for c in (2, 3)]))
+            for scan in scans
+            for stamp, place in ((scan.stamp_ns * 1e-9, place) for place in scan.position)
+        ]
+        assert np.sum(np.array(near) < 15.0) > 0.6 * filled

@@ -6,14 +6,16 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The tables of docs/reliability.md are those of its results, and what falls short is said."""
+"""The tables of docs/reliability.md are those of its results, and what falls short is said; and
+the short form of a day at sea: minutes of it, offline."""
 
 import json
 
 from helpers.source import ROOT
+import numpy as np
 import pytest
 
-from benchmarks import reliability
+from benchmarks import reliability, soak
 
 if not (ROOT / 'docs' / 'reliability.md').is_file():
     pytest.skip('these tests read the source tree', allow_module_level=True)
@@ -111,24 +113,54 @@ sys.exit(3)
     return tmp_path / 'parts'
 
 
-def run(monkeypatch, *words):
-    monkeypatch.setattr('sys.argv', ['reliability', *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        reliability.main()
-    return ended.value.code
-
-
 def test_parts_are_run_and_what_was_broken_off_goes_on(toy, monkeypatch, capsys):
+    def run(*words):
+        monkeypatch.setattr('sys.argv', ['reliability', str(toy), *words])
+        with pytest.raises(SystemExit) as ended:
+            reliability.main()
+        return ended.value.code
+
     toy.mkdir()
     rows = [{'system': 'diver', 'signal': 'SIGINT', 'tried': 2, 'clean': 2, 'why': []}]
     (toy / 'signals.json').write_text(json.dumps(rows))
-    assert run(monkeypatch, toy, '--run') == 0
+    assert run('--run') == 0
     assert (toy / 'notes').read_text() == 'SIGHUP '  # the other one was there
     assert '4 of 4 nodes ended so: SIGINT, SIGHUP.' in reliability.PAGE.read_text()
     assert 'signals: ended with exit code 3' in capsys.readouterr().out
     rows = json.loads((toy / 'signals.json').read_text())
     rows[0]['clean'] = 1
     (toy / 'signals.json').write_text(json.dumps(rows))
-    assert run(monkeypatch, toy) == 1
-    assert run(monkeypatch, toy, '--run', 'signals') == 0
+    assert run() == 1 and run('--run', 'signals') == 0
     assert (toy / 'notes').read_text() == 'SIGHUP SIGINT '  # what fell short is tried again
+
+
+LIMITS = {
+    'diver': (0.3, 1.0), 'obstacle': (0.3, 1.5), 'bathymetry': (0.06, 3.0),
+    'fathometer': (0.3, 10.0),  # its particles come and go by megabytes
+}  # fmt: skip
+"""Hours, and MB by which the second half may grow."""
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize('system', LIMITS)
+def test_a_tracker_grows_and_slows_no_more_once_it_is_warm(system):
+    hours, limit = LIMITS[system]
+    result = soak.offline(system, hours)
+    assert result['messages'] > 50 and result['uncounted'] == 0
+    assert result['grown_mb'] < limit
+    assert result['p50_last_ms'] < 3.0 * result['p50_first_ms'] + 1.0
+
+
+def test_growth_and_slowing_down_show():
+    hours = np.linspace(0.0, 2.0, 200)
+    memory = list(zip(hours, 100.0 + 3.0 * hours))
+    times = np.linspace(1e-3, 5e-3, 1000)
+    result = soak.summary(memory, times, sent=1000, counted=998)
+    assert result['slope_mb_per_h'] == pytest.approx(3.0)
+    assert result['slope_low'] == pytest.approx(3.0) and 2.0 < result['grown_mb'] < 3.1
+    assert result['uncounted'] == 2 and result['p99_last_ms'] > 3.0 * result['p99_first_ms']
+
+
+def test_stamps_go_on_from_one_turn_to_the_next():
+    stamps = [stamp for topic, _, stamp in soak.stamps_of('diver', 0.06)]
+    assert len(stamps) > 202 and set(np.diff(stamps)) == {10**9}

@@ -6,12 +6,15 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The harness of the studies: options from parameters, tables as they come, one file."""
+"""The harness of the studies: options from parameters, tables as they come, one file; and studies
+in their smallest size: each row has its numbers, and the pages find them."""
 
 from collections.abc import Sequence
 from datetime import date
 import functools
+from importlib import import_module
 import json
+import math
 import os
 import runpy
 import shlex
@@ -113,3 +116,36 @@ def test_the_command_of_every_result_works(command, monkeypatch):
     monkeypatch.setattr('sys.argv', [name, *words])
     runpy.run_module(name, run_name='__main__')
     assert len(taken) == 1
+
+
+SMALL = {
+    'bathymetry_paper': ({'pings': 1, 'parts': ['methods']}, {}, 'methods>defaults>patch'),
+    'bathymetry_sea': ({'pings': 2, 'only': 'nadir'}, {}, 'cases>nadir, terrain>rmse_m'),
+    'bathymetry_surfaces': (
+        {'pings': 1},
+        {'SIZES': {'ledge': (2.0, 3.0)}, 'BANDS': ((17.0, 77.0),)}
+        | {'SETTINGS': {'8 staves': {}}, 'FLOORS': {'flat': ('thermal', {'patch_std': 0.0})}},
+        'resolved>ledge, 8 staves>rmse_m',
+    ),
+    'fathometer_gaps': (
+        {'runs': 1, 'particles': 200, 'drawn': 2, 'cases': ['30 missing, walk 0.1 m']},
+        {},
+        'table>30 missing, walk 0.1 m, Kalman>inside',
+    ),
+    'obstacle_accuracy': ({'runs': 5, 'cases': ['images']}, {}, 'images>found>steady>21 dB'),
+}
+"""Options, what is made smaller besides, and a number."""
+
+
+@pytest.mark.parametrize('name', SMALL)
+def test_a_small_study_has_its_numbers(name, monkeypatch):
+    options, changes, place = SMALL[name]
+    module = import_module(f'benchmarks.{name}')
+    for key, value in changes.items():
+        monkeypatch.setattr(module, key, value)
+    found = {}
+    for part in module.main(**options):
+        study.merge(found, part)
+    for key in place.split('>'):
+        found = next(iter(found.values())) if key == '*' else found[key]
+    assert math.isfinite(found)

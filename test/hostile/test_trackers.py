@@ -14,8 +14,7 @@
 import warnings
 
 from helpers.hostile.files import file_results, FILES
-from helpers.hostile.mutations import MUTATIONS
-from helpers.hostile.runs import Bad, BATCH, batches, run, run_extreme, Tally
+from helpers.hostile.runs import Bad, BATCH, batches, MUTATIONS, run, run_extreme, Tally
 from helpers.hostile.streams import stream, templates, VARIANTS
 from hypothesis import given, HealthCheck, settings
 import numpy as np

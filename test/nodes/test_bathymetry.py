@@ -25,28 +25,6 @@ from sonar_imm.soundings import soundings_of
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 
-def test_a_ping_becomes_the_floor_under_it(make_bench):
-    bench = make_bench(p=['max_wait:=0.0'])
-    node = bench.start(BathymetryNode)
-    tables = bench.listen(PointCloud2, '/bathymetry/estimate', lockstep_qos())
-    bench.spin_until(lambda: node.count_subscribers('/bathymetry/estimate'))
-    scene = simulate(scenario('paper', {'pings': 3, 'last_range': 24.0}), 3)
-    snapshots = [item.measurement for item in scene.measurements]
-    publisher = bench.publisher(PointCloud2, '/snapshot')
-    bench.send(node, publisher, *(write_snapshot(snapshot, make) for snapshot in snapshots))
-    bench.spin_until(lambda: len(tables) == 3)
-    for message, snapshot, true in zip(tables, snapshots, scene.truth):
-        estimate = read_estimate(message)
-        assert estimate.stamp_ns == snapshot.stamp_ns and estimate.frame_id == 'sonar'
-        assert len(estimate) == len(snapshot)
-        assert np.sqrt(np.mean(np.square(estimate.state[20:, 0] - true.height[20:]))) < 0.1
-        # What RViz2 and Foxglove draw: starboard is to the right, the floor 15 m below.
-        assert np.median(np.abs(estimate.xyz[20:, 2] + 15.0)) < 0.1
-        assert (estimate.xyz[20:, 1] < 0.0).all()
-        assert set(estimate.extras['label']) <= {0, 1}
-    assert not node._errors
-
-
 def test_with_navigation_soundings_and_shares_are_published(make_bench):
     """One node for both sides; what `~/soundings` says is what the offline table holds."""
     bench = make_bench(p=['max_wait:=0.0', 'navigation:=required'])

@@ -30,18 +30,12 @@ def start(make_bench, tmp_path):
     return lambda *given: Rig(make_bench(p=[f'state_file:={tmp_path / "state"}', *given]))
 
 
-def end(rig):
-    """Stop the node, so that it saves."""
-    rig.bench.end(rig.node)
-
-
 @pytest.mark.skipif(fcntl is None, reason='there are no locks')
 def test_a_second_node_with_the_same_file_leaves_it_alone(start, tmp_path, capfd):
     """As two namespaces do that share one parameter file; then the first one ends."""
     first = start()
-    for fix in (a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0)):
-        first.send(fix)
-        first.node._saved_state.save(first.node._config, wait=True)
+    first.send(a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0))
+    first.node._saved_state.save(first.node._config, wait=True)
     assert not (tmp_path / 'state.refused').exists()
     written = (tmp_path / 'state').read_bytes()
     second = start()
@@ -50,9 +44,9 @@ def test_a_second_node_with_the_same_file_leaves_it_alone(start, tmp_path, capfd
     second.send(a_fix(3.0, 4.0, 4.0))
     second.node._saved_state.save(second.node._config, wait=True)
     assert (tmp_path / 'state').read_bytes() == written
-    end(first)
+    first.end()
     second.send(a_fix(4.0, 4.0, 4.0))
-    end(second)
+    second.end()
     assert not capfd.readouterr().err.count('another node')
     assert read_state(tmp_path / 'state').newest_ns == 4 * 10**9
     assert read_state(tmp_path / 'state.refused').newest_ns == 2 * 10**9
@@ -64,7 +58,7 @@ def test_a_node_that_is_started_again_goes_on_and_a_reset_is_kept(start, tmp_pat
     rig.send(a_fix(0.5, 9.0, 9.0))
     rig.bench.call(Trigger, '/walker/reset', Trigger.Request())
     rig.send(a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0))
-    end(rig)
+    rig.end()
     assert [path.name for path in tmp_path.iterdir()] == ['state']
     again = start()
     again.send(a_fix(2.0, 2.0, 8.0), a_fix(3.0, 4.0, 4.0), a_fix(4.0, 2.0, 0.0, 'odom'))
@@ -94,7 +88,7 @@ def test_files_that_cannot_be_used_are_named_and_kept(start, tmp_path, capfd):
     assert 'is not used: it is no state of a tracker' in capfd.readouterr().err
     assert (tmp_path / 'state').read_text() == 'shopping list'
     rig.send(a_fix(1.0))
-    end(rig)
+    rig.end()
     assert (tmp_path / 'state.refused').read_text() == 'shopping list'
     assert read_state(tmp_path / 'state').system == 'walker'
 
@@ -103,7 +97,7 @@ def test_a_state_that_does_not_go_with_what_is_measured_is_given_up(start, tmp_p
     """It loads, and the tracker raises at the first measurement: the node goes on without it."""
     rig = start()
     rig.send(a_fix(1.0))
-    end(rig)
+    rig.end()
     header, arrays = parts_of(tmp_path / 'state')
     header['state']['tracker']['fixes'] = [[1, 'a fix']]
     forge(tmp_path / 'state', header, arrays)
@@ -113,7 +107,7 @@ def test_a_state_that_does_not_go_with_what_is_measured_is_given_up(start, tmp_p
     assert said.count('does not go with what is measured (AttributeError)') == 1
     assert 'Traceback' not in said and 'internal error' not in said
     assert sorted(again.node.tracker.fixes) == [3 * 10**9, 4 * 10**9]
-    end(again)
+    again.end()
     assert read_state(tmp_path / 'state').newest_ns == 4 * 10**9
     assert (tmp_path / 'state.refused').exists()
 
@@ -121,18 +115,18 @@ def test_a_state_that_does_not_go_with_what_is_measured_is_given_up(start, tmp_p
 def test_other_parameters_and_old_states_are_not_used(start, tmp_path, capfd, monkeypatch):
     rig = start()
     rig.send(a_fix(1.0))
-    end(rig)
-    end(start('steps:=4'))
+    rig.end()
+    start('steps:=4').end()
     assert 'other parameters: steps was 3, is 4' in capfd.readouterr().err
-    end(start('frame_id:=map'))
+    start('frame_id:=map').end()
     assert 'another frame_id or world_frame_convention' in capfd.readouterr().err
     now = time.time_ns()
     with monkeypatch.context() as clock:
         clock.setattr('time.time_ns', lambda: now + 400 * 10**9)
-        end(start())
+        start().end()
         assert re.search('saved 4.. s ago, state_max_age is 300 s', capfd.readouterr().err)
         clock.setattr('time.time_ns', lambda: now - 500 * 10**9)
-        end(start())
+        start().end()
         assert 's ahead of the clock' in capfd.readouterr().err
     start('slow_share:=0.5', 'fast_share:=0.5')
     assert 'goes on from the state' in capfd.readouterr().err
@@ -141,7 +135,7 @@ def test_other_parameters_and_old_states_are_not_used(start, tmp_path, capfd, mo
 def test_measurements_of_another_time_end_the_state_and_one_outlier_does_not(start, capfd):
     rig = start()
     rig.send(a_fix(1000.0, 9.0, 9.0))
-    end(rig)
+    rig.end()
     again = start()
     again.send(a_fix(5000.0), a_fix(1001.0, 1.0, 1.0))
     assert again.node._saved_state._loaded_ns is None
@@ -152,7 +146,7 @@ def test_measurements_of_another_time_end_the_state_and_one_outlier_does_not(sta
     other.send(*[a_fix(5000.0 + k, 1.0, 1.0) for k in range(4)])
     assert 'are +4002 s from the last one of the state' in capfd.readouterr().err
     assert sorted(other.node.tracker.fixes) == [5002 * 10**9, 5003 * 10**9]
-    end(other)
+    other.end()
     earlier = start()
     earlier.send(*[a_fix(100.0 + k, 1.0, 1.0) for k in range(3)])
     assert 'are -4901 s from the last one of the state' in capfd.readouterr().err

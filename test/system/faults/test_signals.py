@@ -51,14 +51,16 @@ def test_a_signal_at_any_moment_ends_a_busy_node_and_it_starts_again(how, figure
             time.sleep(0.2 * rng.random())
             for rig in rigs:
                 rig.node.process.send_signal(how)
-            unclean += reasons_unclean(rigs, -9 if how == 9 else 0)
+            for rig in rigs:
+                unclean += reason_unclean(rig.node, -9 if how == 9 else 0)
             if how == signal.SIGKILL:
                 # Under other domains: those of before take who was killed for alive for a while.
                 rigs = begun(stack, discovery)
                 for rig in rigs:
                     rig.send(rig.case.messages()[0])
                     rig.node.process.send_signal(signal.SIGINT)
-                unclean += reasons_unclean(rigs, 0)
+                for rig in rigs:
+                    unclean += reason_unclean(rig.node, 0)
     for system in SYSTEMS:
         mine = [why for name, why in unclean if name == system]
         key = {'system': system, 'signal': how.name}
@@ -99,22 +101,16 @@ def begun(stack, discovery):
     return rigs
 
 
-def reasons_unclean(rigs, expected):
-    return [why for rig in rigs for why in reason_unclean(rig.node, expected)]
-
-
 def reason_unclean(node, expected):
     """What was wrong with the end of a node, with its name; nothing where it was clean."""
     try:
         code = node.process.wait(END_LIMIT)
     except subprocess.TimeoutExpired:
-        given = f'it did not end within {END_LIMIT:g} s: {_doing(node.process.pid)}, {node.log()}'
-        return [(node.system, given[-1000:])]
-    if code != expected:
-        return [(node.system, f'exit code {code}: {node.log()[-500:]}')]
+        code = f'none within {END_LIMIT:g} s: {_doing(node.process.pid)}'
     message = own_words(node.log())
     words = [word for word in ('Traceback', 'Error', 'terminate called') if word in message]
-    return [(node.system, f'{words}: {message[-500:]}')] if words else []
+    wrong = words or code != expected
+    return [(node.system, f'exit code {code}, {words}: {message[-500:]}')] if wrong else []
 
 
 def _doing(pid):
