@@ -6,15 +6,20 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The files of the study of conversions, written byte by byte, hold what the converters find; and
-the recordings of others that only the studies read."""
+"""The files of the study of conversions, written byte by byte, hold what the converters find; the
+recordings of others that only the studies read; which seed of our own is typical, and what limit
+follows from the runs of a scene."""
+
+from argparse import Namespace
 
 import numpy as np
 import pytest
 
 from benchmarks import conversions
 from benchmarks.recordings import autoferry, DATA, scans_of, truth_of
+from benchmarks.typical_seed import readme, scored, typical
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.evaluation.judging import Limit
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 
@@ -108,3 +113,45 @@ def test_the_real_scenario_lies_around_its_truth():
             for stamp, place in ((scan.stamp_ns * 1e-9, place) for place in scan.position)
         ]
         assert np.sum(np.array(near) < 15.0) > 0.6 * filled
+
+
+def runs_of(values):
+    return {seed: {'rmse': value} for seed, value in enumerate(values, start=1)}
+
+
+def test_the_seed_is_that_of_the_median_and_nine_in_ten_are_within_the_limit():
+    error = np.random.default_rng(0).permutation(np.arange(1.0, 32.0))
+    found = typical(runs_of(error), ['rmse'])
+    assert error[found.seed - 1] == 16.0 and found.spread['rmse']['of the seed'] == 16.0
+    assert found.limit == 28.0 and (error <= found.limit).sum() == 28
+
+
+def test_a_run_without_the_error_is_worse_than_any_and_most_must_have_it():
+    runs = runs_of([1.0, 2.0, 3.0]) | {9: {}}
+    assert typical(runs, ['rmse']).seed == 2
+    with pytest.raises(ValueError, match='most runs have no nees; there are: rmse'):
+        typical(runs, ['nees'])
+
+
+def test_the_text_names_the_command_the_seeds_and_the_limit():
+    given = Namespace(
+        system='diver', scene='table1', runs=5, seed=1, set=['speed=2'],
+        metric=['position.rmse_m'], compress=[], keep=None, write='somewhere/diver_table1',
+    )  # fmt: skip
+    runs = {k: {'position.rmse_m': v} for k, v in enumerate([5.0, 1.0, 3.0, 2.0, 4.0], start=1)}
+    found = typical(runs, given.metric)
+    text = readme(given, found, Limit(1.0, 'm', 'position RMSE', 'position.rmse_m'), 0)
+    assert 'simulate diver bags/diver_table1 --scenario table1 --seed 3 --set speed=2' in text
+    assert 'Number 3 of seeds 1 to 5' in text and 'allows 4.6 m' in text
+    assert 'somewhere' not in text
+    kept = typical(runs, given.metric, 5)
+    assert (kept.seed, kept.rank, kept.limit) == (5, 4, found.limit)
+
+
+def test_a_seed_is_simulated_tracked_and_scored_with_what_its_scene_has(capsys):
+    scene = ('--scenario', 'approach', '--seed', '7')
+    short = ('--set', 'first_range=30', '--set', 'last_range=20')
+    found = scored('obstacle', [*scene, *short])
+    assert found['gospa.mean_m'] > 0.0 and found['tracks.true_obstacles'] == 1.0
+    assert scored('obstacle', [*scene, '--set', 'nothing=1']) == {}
+    assert 'nothing' in capsys.readouterr().err

