@@ -12,8 +12,7 @@ from attrs import evolve
 from helpers.diver_runs import arrivals
 from helpers.sea_vectors import vectors
 import numpy as np
-from oracles.student_t import student_t_maximum
-from oracles.subset_update import subset_update
+from oracles.robust import student_t_maximum, subset_update
 import pytest
 
 from msg_adapters.arrivals import MAX_PAIRS
