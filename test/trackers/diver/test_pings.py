@@ -13,8 +13,7 @@ from attrs import evolve
 from helpers.diver_runs import arrivals, both_sides, followed, miss, numbers_of, SECOND
 from helpers.sea_vectors import vectors
 import numpy as np
-from oracles.student_t import student_t_maximum
-from oracles.subset_update import subset_update
+from oracles.robust import student_t_maximum, subset_update
 import pytest
 from scipy.optimize import least_squares
 
