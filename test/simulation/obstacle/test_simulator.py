@@ -448,9 +448,10 @@ def test_a_mover_starts_and_stops(changes, moving):
     ]  # fmt: skip
 
 
-def test_speeds_in_the_wrong_order_are_refused():
-    with pytest.raises(ConfigError, match='obstacle_speed'):
-        scenario('mover', {'obstacle_speed': [2.0, 1.0]})
+@pytest.mark.parametrize('name, wrong', [('obstacle_speed', [2.0, 1.0]), ('last_range', 95.0)])
+def test_limits_in_the_wrong_order_are_refused(name, wrong):
+    with pytest.raises(ConfigError, match=name):
+        scenario('mover', {name: wrong})
 
 
 def test_what_sways_has_its_deviation_and_forgets_in_its_time():
