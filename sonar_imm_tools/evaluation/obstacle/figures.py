@@ -40,11 +40,14 @@ def sections(
     """The sections of one run. metrics: content of ``metrics.json``; received: the measurements;
     gap: seconds without truth across which it is not interpolated; origin: as `map_section`."""
     yield from map_section(series, received, origin)
+    # The obstacle that each track was matched with last.
+    pairs = () if found is None else zip(found.series.track_id[found.row], found.target)
+    last = {int(track): truth[target] for track, target in pairs}
     yield Section(
         'Height over range',
         'How far each obstacle lies below the sonar, as it comes nearer from left to right. '
         f'Shaded: the 90 % band.{" Dotted: truth." if truth else ""}',
-        offset_figure(series, _truths(found, truth), gap),
+        offset_figure(series, last, gap),
         picture=True,
     )
     yield Section(
@@ -129,14 +132,6 @@ def map_section(
         'Seen from above: the way of the vehicle, and where each track has its obstacle.',
         figure if origin is None else plot.in_degrees(figure, origin),
     )
-
-
-def _truths(found: Matching | None, truth: Sequence[TruePath]) -> dict[int, TruePath]:
-    """The obstacle that each track was matched with last."""
-    if found is None:
-        return {}
-    tracks = found.series.track_id[found.row].tolist()
-    return {track: truth[target] for track, target in zip(tracks, found.target.tolist())}
 
 
 def _by_track(series: Series) -> Iterator[tuple[str, str, Series]]:
