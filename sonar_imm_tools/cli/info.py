@@ -33,8 +33,8 @@ def command(bag: Path, strict: bool, as_json: bool) -> None:
     no tracker can use it.
     """
     from ..offline.inspection import inspect
+    from ..recordings.measurements import system_in_mind, types_heard
     from ..recordings.reader import BagReader
-    from ..recordings.topics import system_in_mind, types_heard
 
     with BagReader(bag, strict=strict) as reader:
         total = sum(topic.count for topic in reader.topics)

@@ -51,15 +51,8 @@ PLAIN = 'recording'
 """Name of the storage file in a folder whose own name metadata.yaml cannot hold."""
 
 _RELIABLE = Qos(
-    QosHistory.KEEP_LAST,
-    10,
-    QosReliability.RELIABLE,
-    QosDurability.VOLATILE,
-    QosTime(0, 0),
-    QosTime(0, 0),
-    QosLiveliness.SYSTEM_DEFAULT,
-    QosTime(0, 0),
-    False,
+    *(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE, QosTime(0, 0)),
+    *(QosTime(0, 0), QosLiveliness.SYSTEM_DEFAULT, QosTime(0, 0), False),
 )
 
 
@@ -169,10 +162,8 @@ class BagWriter:
             self._chunk = None
 
     def _link(self, topic: str, type_name: str) -> Connection:
-        link = self._links.get((topic, type_name))
-        if link is None:
-            link = self._writer.add_connection(
+        if (topic, type_name) not in self._links:
+            self._links[topic, type_name] = self._writer.add_connection(
                 topic, type_name, typestore=typestore(), offered_qos_profiles=[_RELIABLE]
             )
-            self._links[topic, type_name] = link
-        return link
+        return self._links[topic, type_name]

@@ -28,7 +28,7 @@ from sonar_imm.truth import TrueTrack
 from sonar_imm_tools.offline.inspection import inspect
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.offline.tracking import InputOptions, OfflineRun, write_run
-from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.measurements import fitting_topics, measurements_of
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.positions import (
     GAP_S,
@@ -38,7 +38,6 @@ from sonar_imm_tools.recordings.positions import (
     write_position,
 )
 from sonar_imm_tools.recordings.reader import BagError, BagReader
-from sonar_imm_tools.recordings.topics import fitting_topics
 from sonar_imm_tools.recordings.truth import records_of
 from sonar_imm_tools.recordings.writer import BagWriter
 

@@ -20,8 +20,8 @@ import pytest
 from msg_adapters.estimates import read_estimate
 from sonar_imm.measurements import Fix
 from sonar_imm.truth import Received, Scene, TrueReflectors, TrueTrack, TruthTable
-from sonar_imm_tools.recordings import csv_writer
-from sonar_imm_tools.recordings.csv_writer import CsvWriter, FEW_ROWS, ROWS_IN_A_BLOCK
+from sonar_imm_tools.recordings import export
+from sonar_imm_tools.recordings.export import CsvWriter, FEW_ROWS, ROWS_IN_A_BLOCK
 from sonar_imm_tools.recordings.messages import decode_cdr, ros_message, typestore
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
@@ -174,9 +174,9 @@ def plain(columns):
 @pytest.fixture
 def without_pyarrow(monkeypatch):
     monkeypatch.setitem(sys.modules, 'pyarrow', None)
-    csv_writer._arrow.cache_clear()
+    export._arrow.cache_clear()
     yield
-    csv_writer._arrow.cache_clear()
+    export._arrow.cache_clear()
 
 
 @pytest.mark.filterwarnings('ignore:overflow encountered')
@@ -195,23 +195,21 @@ def test_blocks_follow_one_another(rows):
 
 def test_pyarrow_writes_them_where_it_is_there():
     pytest.importorskip('pyarrow')
-    assert csv_writer._arrow() is not None
+    assert export._arrow() is not None
 
 
 def test_the_same_bytes_without_pyarrow(without_pyarrow):
-    assert csv_writer._arrow() is None
+    assert export._arrow() is None
     assert written([SPREAD, SPREAD]) == plain([SPREAD, SPREAD])
 
 
 def test_a_pyarrow_with_other_digits_is_not_used(monkeypatch):
     pytest.importorskip('pyarrow')
-    monkeypatch.setattr(
-        csv_writer, '_texts', lambda column, arrow: arrow.array(['1'] * len(column))
-    )
-    csv_writer._arrow.cache_clear()
-    assert csv_writer._arrow() is None
+    monkeypatch.setattr(export, '_texts', lambda column, arrow: arrow.array(['1'] * len(column)))
+    export._arrow.cache_clear()
+    assert export._arrow() is None
     assert written([SPREAD]) == plain([SPREAD])
-    csv_writer._arrow.cache_clear()
+    export._arrow.cache_clear()
 
 
 # -- scenes become bags: each class by its own writer, in the order of reception

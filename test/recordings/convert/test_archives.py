@@ -25,8 +25,8 @@ from sonar_imm_tools.recordings.convert import (
     convert_snapshots,
     convert_traces,
     KINDS,
+    sniff,
 )
-from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 
 

@@ -22,13 +22,12 @@ import yaml
 from msg_adapters.soundings import read_ground
 from sonar_imm.measurements import Detections, Navigation, Rejection, Snapshot
 from sonar_imm_tools.recordings.conversion import ConversionReport
-from sonar_imm_tools.recordings.convert import convert_pictures, convert_xtf
-from sonar_imm_tools.recordings.convert import side_scan as convert_side_scan
+from sonar_imm_tools.recordings.convert import convert_pictures, convert_xtf, sniff
+from sonar_imm_tools.recordings.convert import xtf as xtf_files
+from sonar_imm_tools.recordings.convert.xtf import pings_of
 from sonar_imm_tools.recordings.convert_options import XtfOptions
 from sonar_imm_tools.recordings.reader import BagReader
-from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
-from sonar_imm_tools.recordings.xtf import pings_of
 
 SIDES = [('port', 'port', 'uint16'), ('stbd', 'starboard', 'uint16')]
 
@@ -396,17 +395,15 @@ def channel(samples=(1, 2, 3), **changes):
     'delay, near', [(0.0, 0.0), (0.01, 7.5), (9.99, 7492.5), (10.0, 0.0), (-1.0, 0.0)]
 )
 def test_a_sample_lies_in_the_middle_of_its_bin_and_the_delay_is_there_and_back(delay, near):
-    ranges = convert_side_scan._ranges(channel(delay=delay), 1500.0)
+    ranges = xtf_files._ranges(channel(delay=delay), 1500.0)
     assert ranges == pytest.approx(near + np.array([12.5, 37.5, 62.5]))
 
 
 @pytest.mark.parametrize('far', [0.0, -1.0, math.nan, math.inf, 10_000.1])
 def test_a_slant_range_that_no_sonar_has_is_refused(far):
-    assert convert_side_scan._ranges(channel(slant_range=10_000.0), 1500.0)[-1] == pytest.approx(
-        8333.333
-    )
+    assert xtf_files._ranges(channel(slant_range=10_000.0), 1500.0)[-1] == pytest.approx(8333.333)
     with pytest.raises(Rejection, match='slant range'):
-        convert_side_scan._ranges(channel(slant_range=far), 1500.0)
+        xtf_files._ranges(channel(slant_range=far), 1500.0)
 
 
 @pytest.mark.parametrize(
@@ -420,21 +417,21 @@ def test_a_slant_range_that_no_sonar_has_is_refused(far):
     ],
 )
 def test_the_range_of_whole_numbers_is_one_turn(samples, radians_per_count, turn):
-    assert convert_side_scan._turns(samples, radians_per_count) == pytest.approx([turn])
+    assert xtf_files._turns(samples, radians_per_count) == pytest.approx([turn])
 
 
 def test_a_phase_is_that_of_stave_one_against_stave_zero():
     channels = [channel([4, 4]), channel(np.array([0, 16384], np.int16), name='Phase')]
-    made = convert_side_scan._interferometer(PING, 'port', channels, XtfOptions())
+    made = xtf_files._interferometer(PING, 'port', channels, XtfOptions())
     assert made.iq == pytest.approx(np.array([[4.0, 4.0], [4.0, 4.0j]]), abs=1e-6)
     assert made.sample_rate == pytest.approx(0.5 * 1500.0 / 37.5) and made.side == 'port'
-    assert convert_side_scan._interferometer(PING, 'port', channels[:1], XtfOptions()) is None
+    assert xtf_files._interferometer(PING, 'port', channels[:1], XtfOptions()) is None
 
 
 @pytest.mark.parametrize('order, first', [('far', 3.0), ('near', 1.0)])
 def test_port_may_be_told_from_far_to_near(order, first):
     ping = {'channels': [channel(), channel(side='starboard'), channel(side='', samples=[9])]}
-    found = convert_side_scan._sides(ping, order)
+    found = xtf_files._sides(ping, order)
     assert found['port'][0]['samples'][0] == first
     assert found['starboard'][0]['samples'][0] == 1.0 and set(found) == {'port', 'starboard'}
 
@@ -447,8 +444,8 @@ def test_more_than_a_hundredth_at_full_scale_is_said(clipped, top, full, tmp_pat
     samples = np.ones(100, np.int16)
     samples[:clipped] = top
     how, report, channels = XtfOptions(), ConversionReport(tmp_path), [channel(samples)]
-    seen = convert_side_scan._Seen(how)
-    seen.image(convert_side_scan._image(PING, channels, how), channels, 1)
+    seen = xtf_files._Seen(how)
+    seen.image(channels, 1)
     seen.tell(tmp_path / 'a.xtf', report)
     assert seen.clipped == full and seen.samples == 100
     assert any('full scale' in question for question in report.questions) == (full > 1)
@@ -458,9 +455,10 @@ def test_samples_at_full_scale_are_those_of_the_frequency_that_is_used(tmp_path)
     loud, calm = np.full(100, 32767, np.int16), np.ones(100, np.int16)
     channels = [channel(loud, frequency=4e5), channel(calm, frequency=9e5)]
     for frequency, clipped in ((None, 100), (4.1e5, 100), (8e5, 0)):
-        seen = convert_side_scan._Seen(XtfOptions(frequency=frequency))
-        image = convert_side_scan._image(PING, channels, seen.how)
-        seen.image(image, channels, 1)
+        seen = xtf_files._Seen(XtfOptions(frequency=frequency))
+        magnitudes = xtf_files._magnitudes(channels, seen.how)
+        image = xtf_files._image(PING, magnitudes[0], seen.how)
+        seen.image(magnitudes, 1)
         assert seen.clipped == clipped and (image.amplitude.max() == 32767) == (clipped > 0)
         report = ConversionReport(tmp_path)
         seen.tell(tmp_path / 'a.xtf', report)
