@@ -42,15 +42,12 @@ def threads_of(tmp_path_factory):
     tmp_path = tmp_path_factory.mktemp('witness')
     (tmp_path / 'sitecustomize.py').write_text(WITNESS)
 
-    def run(*arguments, **message):
-        kept = {
-            name: value
-            for name, value in os.environ.items()
-            if not name.startswith(tuple(f'{each}_NUM_THREADS' for each in SETTINGS))
-        }
+    def run(*arguments, **said):
+        told = tuple(f'{each}_NUM_THREADS' for each in SETTINGS)
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(told)}
         paths = os.pathsep.join([str(tmp_path), str(ROOT), str(ROOT / 'test')])
         done = subprocess.run(
-            [sys.executable, *arguments], env={**kept, 'PYTHONPATH': paths, **message},
+            [sys.executable, *arguments], env={**kept, 'PYTHONPATH': paths, **said},
             capture_output=True, text=True, cwd=tmp_path,
         )  # fmt: skip
         assert 'threads ' in done.stderr, done.stderr

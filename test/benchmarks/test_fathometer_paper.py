@@ -12,13 +12,7 @@ from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
-from benchmarks.fathometer_paper import (
-    BOOTSTRAP,
-    ChangedTracker,
-    ENVELOPE,
-    PENALTY,
-    score,
-)
+from benchmarks.fathometer_paper import BOOTSTRAP, ChangedTracker, ENVELOPE, PENALTY, score
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 
@@ -27,21 +21,15 @@ from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 def drift():
     """(trace, true depths) of the first 60 records of the vectors."""
     kept = load_vectors('fathometer/mvdr_traces')
-    strength = kept['reflector_amplitude']
+    strength, depth = kept['reflector_amplitude'], kept['depth']
     there = strength > 0.4 * strength.max(axis=0)
     sigma = np.broadcast_to(np.ravel(kept['sigma']), len(strength))
-    return [
-        (
-            Trace(
-                stamp_ns=(k + 1) * 90 * 10**9,
-                depth=kept['depth'],
-                amplitude=kept['amplitude'][k],
-                sigma=np.full(len(kept['depth']), sigma[k]),
-            ),
-            kept['reflector_depth'][k][there[k]].astype(float),
-        )
-        for k in range(60)
-    ]
+    found = []
+    for k in range(60):
+        heard = {'amplitude': kept['amplitude'][k], 'sigma': np.full(len(depth), sigma[k])}
+        trace = Trace(stamp_ns=(k + 1) * 90 * 10**9, depth=depth, **heard)
+        found.append((trace, kept['reflector_depth'][k][there[k]].astype(float)))
+    return found
 
 
 def distance(drift, changes, **values):

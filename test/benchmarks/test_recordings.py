@@ -15,47 +15,29 @@ from benchmarks.recordings import autoferry, DATA, scans_of, truth_of
 
 
 def record(time, measurement, sensor=2):
-    return {
-        'sensorID': sensor,
-        'time': time,
-        'measurement': measurement,
-        'ownshipPosition': [100.0, 200.0],
-    }
+    place = {'ownshipPosition': [100.0, 200.0]}
+    return {'sensorID': sensor, 'time': time, 'measurement': measurement, **place}
 
 
 def test_detections_become_scans_east_first():
     records = [
-        record(9.0, [5.0, -6.0]),
-        record(3.0, [[1.0, 2.0, 3.0], [10.0, 20.0, 30.0]]),
-        record(4.0, []),
-        record(5.0, [0.1, 0.2, 0.3], sensor=4),
-    ]
+        record(9.0, [5.0, -6.0]), record(3.0, [[1.0, 2.0, 3.0], [10.0, 20.0, 30.0]]),
+        record(4.0, []), record(5.0, [0.1, 0.2, 0.3], sensor=4),
+    ]  # fmt: skip
     scans = scans_of(records, 'radar', -1_500_000_000)
-    assert [(scan.stamp_ns, len(scan)) for scan in scans] == [
-        (1_500_000_000, 3),
-        (2_500_000_000, 0),
-        (7_500_000_000, 1),
-    ]
-    assert np.concatenate([scan.position for scan in scans]).tolist() == [
-        [210.0, 101.0, 0.0],
-        [220.0, 102.0, 0.0],
-        [230.0, 103.0, 0.0],
-        [194.0, 105.0, 0.0],
-    ]
+    assert [scan.stamp_ns for scan in scans] == [1_500_000_000, 2_500_000_000, 7_500_000_000]
+    assert [scan.position.tolist() for scan in scans] == [
+        [[210.0, 101.0, 0.0], [220.0, 102.0, 0.0], [230.0, 103.0, 0.0]], [],
+        [[194.0, 105.0, 0.0]],
+    ]  # fmt: skip
     assert not scans_of(records, 'lidar')
 
 
 def test_truth_is_sorted_and_told_once():
-    groups = [
-        [
-            {'targetID': 2, 'position': [7.0, 8.0, 0.0], 'time': 3.5},
-            {'targetID': 1, 'position': [1.0, 2.0, 5.0], 'time': 3.0},
-        ],
-        [{'targetID': 1, 'position': [1.0, 2.0, 5.0], 'time': 3.0}],
-    ]
-    assert truth_of(groups) == pytest.approx(
-        np.array([[3.0, 1.0, 2.0, 1.0], [3.5, 2.0, 8.0, 7.0]])
-    )
+    one = {'targetID': 1, 'position': [1.0, 2.0, 5.0], 'time': 3.0}
+    groups = [[{'targetID': 2, 'position': [7.0, 8.0, 0.0], 'time': 3.5}, one], [one]]
+    due = np.array([[3.0, 1.0, 2.0, 1.0], [3.5, 2.0, 8.0, 7.0]])
+    assert truth_of(groups) == pytest.approx(due)
 
 
 @pytest.mark.skipif(

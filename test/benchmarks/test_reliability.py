@@ -51,6 +51,8 @@ GOOD = {
 def test_the_page_says_what_the_results_say():
     parts = json.loads(reliability.RESULT.read_text(encoding='utf-8'))
     page = reliability.PAGE.read_text(encoding='utf-8')
+    shown = reliability.COLUMNS.keys() | reliability.SENTENCES.keys() | {'faults'}
+    assert set(reliability.PARTS) == shown == reliability.PROGRAMS.keys()
     assert all(f'<!-- reliability: {name} -->' in page for name in reliability.PARTS)
     assert page == reliability.page_of(page, parts), 'run python -m benchmarks.reliability'
 
@@ -64,35 +66,22 @@ def test_a_table_is_made_of_its_part():
     assert 'Not measured yet' in reliability.page_of(page, {})
 
 
-def test_what_is_good_falls_short_of_nothing():
-    assert reliability.short_of(GOOD) == []
-
-
 @pytest.mark.parametrize(
     'part, row, change',
     [
-        ('bounds', 'trace', {'cpu_s': 31.0}),
-        ('bounds', 'trace', {'refused': 1.0}),
-        ('faults', 0, {'recovered': None}),
-        ('faults', 0, {'recovered': 4}),
-        ('faults', 0, {'traceback': True}),
-        ('signals', 0, {'clean': 19}),
-        ('restart', 0, {'equal': 69}),
-        ('damage', 0, {'silent': 1}),
-        ('damage', 0, {'failed': 1}),
-        ('metamorphic', 0, {'states': 2e-6}),
-        ('soak', 'diver', {'slope_low': 1.5}),
-        ('soak', 'diver', {'p99_last_ms': 2.5}),
-        ('soak', 'diver', {'uncounted': 1.0}),
+        ('bounds', 'trace', {'cpu_s': 31.0}), ('bounds', 'trace', {'refused': 1.0}),
+        ('faults', 0, {'recovered': None}), ('faults', 0, {'recovered': 4}),
+        ('faults', 0, {'traceback': True}), ('signals', 0, {'clean': 19}),
+        ('restart', 0, {'equal': 69}), ('damage', 0, {'silent': 1}), ('damage', 0, {'failed': 1}),
+        ('metamorphic', 0, {'states': 2e-6}), ('soak', 'diver', {'slope_low': 1.5}),
+        ('soak', 'diver', {'p99_last_ms': 2.5}), ('soak', 'diver', {'uncounted': 1.0}),
     ],
-)
+)  # fmt: skip
 def test_what_falls_short_is_said(part, row, change):
     spoilt = json.loads(json.dumps(GOOD))
+    assert reliability.short_of(spoilt) == []
     spoilt[part][row] |= change
     assert len(reliability.short_of(spoilt)) == 1
-
-
-def test_a_part_that_is_missing_is_said():
     assert reliability.short_of({}) == [f'{name}: not measured' for name in reliability.PARTS]
 
 
@@ -112,16 +101,13 @@ for name in ('SIGINT', 'SIGHUP'):
         file.write_text(json.dumps(rows))
 sys.exit(3)
 """
+    programs = {'signals': ('-c', program, '{}/signals.json', '{}/notes')}
     monkeypatch.setattr(reliability, 'RESULT', tmp_path / 'result.json')
     monkeypatch.setattr(reliability, 'PAGE', tmp_path / 'page.md')
-    monkeypatch.setattr(
-        reliability, 'PROGRAMS', {'signals': ('-c', program, '{}/signals.json', '{}/notes')}
-    )
+    monkeypatch.setattr(reliability, 'PROGRAMS', programs)
     monkeypatch.setattr(reliability, 'PARTS', ('signals',))
-    page = ''.join(
-        f'<!-- reliability: {name} -->\n<!-- /reliability -->\n' for name in ('run', 'signals')
-    )
-    reliability.PAGE.write_text(page, encoding='utf-8')
+    mark = '<!-- reliability: {} -->\n<!-- /reliability -->\n'
+    reliability.PAGE.write_text(mark.format('run') + mark.format('signals'), encoding='utf-8')
     return tmp_path / 'parts'
 
 
@@ -146,9 +132,3 @@ def test_parts_are_run_and_what_was_broken_off_goes_on(toy, monkeypatch, capsys)
     assert run(monkeypatch, toy) == 1
     assert run(monkeypatch, toy, '--run', 'signals') == 0
     assert (toy / 'notes').read_text() == 'SIGHUP SIGINT '  # what fell short is tried again
-
-
-def test_every_part_has_a_program_and_is_shown():
-    shown = reliability.COLUMNS.keys() | reliability.SENTENCES.keys() | {'faults'}
-    assert set(reliability.PARTS) == shown
-    assert reliability.PROGRAMS.keys() == set(reliability.PARTS)

@@ -14,11 +14,9 @@ import pytest
 from benchmarks import soak
 
 LIMITS = {
-    'diver': (0.3, 1.0),
-    'obstacle': (0.3, 1.5),
-    'bathymetry': (0.06, 3.0),
+    'diver': (0.3, 1.0), 'obstacle': (0.3, 1.5), 'bathymetry': (0.06, 3.0),
     'fathometer': (0.3, 10.0),  # its particles come and go by megabytes
-}
+}  # fmt: skip
 """Hours, and MB by which the second half may grow."""
 
 

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""A small real system for tests of the nodes: the walker. As a program, its node."""
+"""A small real system for tests of the nodes: the walker."""
 
 from collections import Counter
 import sys
@@ -118,15 +118,3 @@ def register(set_item):
     set_item(SYSTEMS, 'walker', walker)
     set_item(sys.modules, 'msg_adapters.displays.walker', msg_adapters.displays.bathymetry)
     set_item(sys.modules, 'msg_adapters.inputs.walker', msg_adapters.inputs.diver)
-
-
-def main():
-    from sonar_imm.nodes.base import TrackerNode
-    from sonar_imm.nodes.running import run
-
-    register(dict.__setitem__)
-    return run(lambda: TrackerNode('walker'))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -26,8 +26,8 @@ from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 
 def test_a_ping_becomes_the_floor_under_it(make_bench):
-    bench = make_bench('-p', 'max_wait:=0.0')
-    node = bench.add(BathymetryNode(context=bench.context))
+    bench = make_bench(p=['max_wait:=0.0'])
+    node = bench.start(BathymetryNode)
     tables = bench.listen(PointCloud2, '/bathymetry/estimate', lockstep_qos())
     bench.spin_until(lambda: node.count_subscribers('/bathymetry/estimate'))
     scene = simulate(scenario('paper', {'pings': 3, 'last_range': 24.0}), 3)
@@ -49,8 +49,8 @@ def test_a_ping_becomes_the_floor_under_it(make_bench):
 
 def test_with_navigation_soundings_and_shares_are_published(make_bench):
     """One node for both sides; what `~/soundings` says is what the offline table holds."""
-    bench = make_bench('-p', 'max_wait:=0.0', '-p', 'navigation:=required')
-    node = bench.add(BathymetryNode(context=bench.context))
+    bench = make_bench(p=['max_wait:=0.0', 'navigation:=required'])
+    node = bench.start(BathymetryNode)
     tables = bench.listen(PointCloud2, '/bathymetry/estimate', lockstep_qos())
     clouds = bench.listen(PointCloud2, '/bathymetry/soundings', lockstep_qos())
     shares = bench.listen(JointState, '/bathymetry/model_probabilities', lockstep_qos())

@@ -13,7 +13,7 @@ import time
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from helpers.node_bench import a_fix, FIX, Rig
+from helpers.node_bench import a_fix, FIX, Rig, values_of
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy
@@ -22,7 +22,6 @@ from msg_adapters.inputs import inputs_of, needed
 from sonar_imm.nodes.ages import Ages
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.diagnostics import clock_offset, Meter, Reporter, Stamp, summary
-from sonar_imm.nodes.messages import message_class
 from sonar_imm.nodes.qos import latched_qos, output_qos
 
 
@@ -51,12 +50,8 @@ class Desk:
     def follow(self, now, *, fix=(), refused=(), dropped=0, spent=(), says=(), **given):
         """What is heard and measured until `now`, a report, and what it has to say: levels,
         `values`, and words of each entry."""
-        heard = {
-            'fix': fix,
-            **{name: given.pop(name, ()) for name in ('arrivals', 'altitude', 'nav')},
-        }
-        for name, times in heard.items():
-            for second in times:
+        for name in ('fix', 'arrivals', 'altitude', 'nav'):
+            for second in fix if name == 'fix' else given.pop(name, ()):
                 self.meter.arrived(name, second)
         for reason in refused:
             self.meter.refuse('fix', reason)
@@ -290,91 +285,67 @@ def test_the_age_of_a_slow_publisher_is_judged_by_its_period(desk):
 
 @pytest.mark.usefixtures('quick')
 def test_a_node_reports_under_its_full_name_and_at_its_period(make_bench, walker):
-    bench = make_bench(
-        '-r', '__ns:=/auv1', '-p', 'use_sim_time:=true'
-    )  # no /clock at all: still it reports
+    # no /clock at all: still it reports
+    bench = make_bench('-r', '__ns:=/auv1', p=['use_sim_time:=true'])
     received = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
-    bench.add(TrackerNode('walker', context=bench.context))
+    bench.start(TrackerNode, 'walker')
     bench.spin_until(lambda: len(received) >= 3 and 'message' in received[-1].status[0].message)
-    assert [status.name for status in received[-1].status] == [
-        'auv1/walker: input',
-        'auv1/walker: tracker',
-    ]
-    values = {pair.key: pair.value for pair in received[-1].status[0].values}
-    assert values['fix topic'] == '/auv1/fix'
+    names = [status.name for status in received[-1].status]
+    assert names == ['auv1/walker: input', 'auv1/walker: tracker']
+    assert values_of(received[-1])['fix topic'] == '/auv1/fix'
     given = 'no message yet on /auv1/fix or /auv1/fixes or /auv1/relative or /auv1/arrivals'
     assert received[-1].status[0].message == given
 
 
-def run(desk, *refused):
-    """Levels of the input while one message a period comes, refused where `refused` says so."""
-    levels = []
-    for second, bad in enumerate(refused):
-        for k in range(2):
-            desk.meter.arrived('fix', second + 0.5 * k)
-        if bad:
-            desk.meter.refuse('fix', 'nan')
-        desk.report(second + 0.9)
-        levels.append(desk.input.level[0])
-    return levels
+def levels(heard, desk=None):
+    """Levels of the input after each period. heard: of each (messages of an input by its name,
+    refused ones, what else is reported)."""
+    desk, found = desk or Desk(rise=2, fall=5), []
+    for second, (messages, refused, *more) in enumerate(heard):
+        for name, count in messages.items():
+            for k in range(count):
+                desk.meter.arrived(name, second + k / max(count, 2))
+        for name in refused:
+            desk.meter.refuse(name, f'bad_{name}')
+        desk.report(second + 0.9, **(more[0] if more else {}))
+        found.append(desk.input.level[0])
+    return found
 
 
 def test_a_level_rises_after_two_bad_periods_falls_after_five_good_ones_and_does_not_flap():
-    levels = run(Desk(rise=2, fall=5), 0, 1, 0, 1, 1, 0, 0, 0, 0, 0, 0)
-    assert levels == [0, 0, 0, 0, 1, 1, 1, 1, 1, 0, 0]
-    desk = Desk(rise=2, fall=5)
-    rng = np.random.default_rng(5)
-    levels = run(desk, *(rng.random(600) < 0.5))
-    assert np.count_nonzero(np.diff(levels)) <= 2 * 600 * 0.5**6 + 8
-    assert np.mean(levels) > 0.8
-    calm = run(Desk(rise=2, fall=5), *([1, 0] * 100))
-    assert not any(calm)  # every other period, never two in a row
+    def of(refused):
+        return levels([({'fix': 2}, ['fix'] * int(bad)) for bad in refused])
+
+    assert of([0, 1, 0, 1, 1, 0, 0, 0, 0, 0, 0]) == [0, 0, 0, 0, 1, 1, 1, 1, 1, 0, 0]
+    found = of(np.random.default_rng(5).random(600) < 0.5)
+    assert np.count_nonzero(np.diff(found)) <= 2 * 600 * 0.5**6 + 8 and np.mean(found) > 0.8
+    assert not any(of([1, 0] * 100))  # every other period, never two in a row
 
 
 @pytest.mark.parametrize('beside', ['', 'heard', 'heard, and refused once'])
 def test_periods_without_a_message_say_nothing(beside):
     """A sensor that is heard every few periods is judged by the periods in which it is, whatever
     is heard `beside` it in all of them."""
-    desk = Desk(rise=2, fall=5)
-    levels = []
-    for second in range(60):
-        if beside:
-            desk.meter.arrived('altitude', second)
-        if 'refused' in beside and second == 0:
-            desk.meter.refuse('altitude', 'no_mounting')
-        if second % 4 == 0:
-            desk.meter.arrived('fix', second)
-            if second < 30:
-                desk.meter.refuse('fix', 'nan')
-        desk.report(second + 0.9)
-        levels.append(desk.input.level[0])
+    heard = [
+        ({'altitude': int(bool(beside)), 'fix': int(second % 4 == 0)},
+         ['altitude'] * ('refused' in beside and second == 0)
+         + ['fix'] * (second % 4 == 0 and second < 30))
+        for second in range(60)
+    ]  # fmt: skip
+    found = levels(heard)
     first, level = 8 if 'refused' in beside else 4, 1 if beside else 2
-    assert levels[:first] == [0] * first and levels[first:32] == [level] * (32 - first)
-    assert levels[47] == level and levels[48:] == [0] * 12
+    assert found[:first] == [0] * first and found[first:32] == [level] * (32 - first)
+    assert found[47] == level and found[48:] == [0] * 12
 
 
 def test_losses_of_a_latched_input_are_over_as_others():
-    desk = Desk(rise=2, fall=5)
-    levels = []
-    for second in range(16):
-        desk.meter.arrived('fix', second)
-        if second % 2 == 0:
-            desk.meter.arrived('tf_static', second)
-        desk.report(second + 0.9, lost={'/tf_static': min(second + 1, 4)})
-        levels.append(desk.input.level[0])
-    assert levels[2:4] == [1, 1] and levels[-1] == 0
+    lost = [{'lost': {'/tf_static': min(second + 1, 4)}} for second in range(16)]
+    found = levels([({'fix': 1, 'tf_static': 1 - k % 2}, (), more) for k, more in enumerate(lost)])
+    assert found[2:4] == [1, 1] and found[-1] == 0
 
 
 def test_all_refused_in_one_period_and_some_in_the_next_are_some_in_both():
-    desk = Desk(rise=2, fall=5)
-    levels = []
-    for second in range(6):
-        for k in range(1 + second % 2):
-            desk.meter.arrived('fix', second + 0.5 * k)
-        desk.meter.refuse('fix', 'nan')
-        desk.report(second + 0.9)
-        levels.append(desk.input.level[0])
-    assert levels == [0] + [1] * 5
+    assert levels([({'fix': 1 + second % 2}, ['fix']) for second in range(6)]) == [0] + [1] * 5
 
 
 def test_the_health_of_a_node_is_its_worst_entry(desk):
@@ -394,24 +365,21 @@ def test_the_health_of_a_node_is_its_worst_entry(desk):
 
 
 def test_a_warning_is_the_same_one_when_its_numbers_change():
-    desk = Desk(rise=2, fall=5)
-    levels = []
+    desk, found = Desk(rise=2, fall=5), []
     for second, share in enumerate((12, 15, 9)):
-        desk.meter.arrived('fix', second)
-        desk.report(second + 0.9, warnings=[f'{share} % of the pings were passed over'])
-        levels.append(desk.tracker.level[0])
-    assert levels == [0, 1, 1] and desk.tracker.message.startswith('9 %')
+        desk.follow(
+            second + 0.9, fix=[second], warnings=[f'{share} % of the pings were passed over']
+        )
+        found.append(desk.tracker.level[0])
+    assert found == [0, 1, 1] and desk.tracker.message.startswith('9 %')
 
 
 @pytest.mark.usefixtures('quick')
 def test_health_waits_for_those_who_ask_later(make_bench, walker):
-    bench = make_bench()
-    node = bench.add(TrackerNode('walker', context=bench.context))
-    fix = bench.peer.create_publisher(message_class(FIX), 'fix', 10)
-    bench.spin_until(fix.get_subscription_count)
-    fix.publish(a_fix(1.0))
-    bench.spin_until(lambda: node._meter.received['fix'])
-    bench.spin_until(lambda: node._announcer.health.level == OK)
+    rig = Rig(make_bench())
+    bench = rig.bench
+    rig.send(a_fix(1.0))
+    bench.spin_until(lambda: rig.node._announcer.health.level == OK)
     late = bench.listen(DiagnosticStatus, '/walker/health', latched_qos())
     bench.spin_until(lambda: late)
     assert (late[0].name, late[0].message) == ('walker', 'receiving; tracking')
@@ -477,8 +445,7 @@ def test_stamps_of_one_clock_are_no_two(desk):
 def test_a_node_with_two_publishers_whose_clocks_disagree_says_so(make_bench, walker):
     rig = Rig(make_bench())
     received = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
-    other = rig.bench.peer.create_publisher(message_class(FIX), '/fix', 10)
-    rig.bench.spin_until(other.get_subscription_count)
+    other = rig.bench.publisher(FIX, '/fix', 10)
     start = time.time()
     rig.bench.spin_until(lambda: received)
     # As long as it takes: where the machine was busy meanwhile, messages came late as well.

@@ -8,27 +8,32 @@
 
 """Where a sonar is on its vehicle is kept by a node that is started again."""
 
-from attrs import evolve
+import json
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from msg_adapters.fixes import write_fix, write_start
 from msg_adapters.inputs import inputs_of
 from msg_adapters.transforms import write_transforms
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.measurements import Detections, Fix, Snapshot, StaticTransforms
+from sonar_imm.measurements import Detections, Fix, Start, StaticTransforms
 from sonar_imm.nodes.bathymetry import BathymetryNode
 from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.obstacle import ObstacleNode
 from sonar_imm.nodes.qos import transforms_qos
 from sonar_imm.trackers.diver.known import track_positions
+from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.messages import ros_message
-from sonar_imm_tools.simulation.bathymetry import simulator as swath
+from sonar_imm_tools.recordings.writer import BagWriter
 from sonar_imm_tools.simulation.obstacle import simulator as ahead
 
 LEVER, RPY = (1.5, -0.3, 0.4), (2.0, -5.0, 8.0)
 ALONE = 'geometry_msgs/msg/TransformStamped'
+HEARD = f"input_types:=['tf_static={ALONE}']"
 
 
 def transform(child, parent, position, rpy):
@@ -36,65 +41,57 @@ def transform(child, parent, position, rpy):
     pose = Pose(np.array(position), geometry.rotation(*np.radians(rpy)))
     given = write_transforms(StaticTransforms(poses={child: (parent, pose)}), ros_message)
     turn = given.transforms[0].transform.rotation
-    where = {
-        'translation': make('geometry_msgs/msg/Vector3', **dict(zip('xyz', position))),
-        'rotation': make(
-            'geometry_msgs/msg/Quaternion', **{name: getattr(turn, name) for name in 'xyzw'}
-        ),
-    }
-    return make(
-        ALONE, header=make('std_msgs/msg/Header', frame_id=parent), child_frame_id=child,
-        transform=make('geometry_msgs/msg/Transform', **where),
-    )  # fmt: skip
+    made = make(ALONE, header=make('std_msgs/msg/Header', frame_id=parent), child_frame_id=child)
+    for part, values in ((made.transform.translation, position), (made.transform.rotation, None)):
+        for k, name in enumerate('xyz' if values else 'xyzw'):
+            setattr(part, name, float(values[k] if values else getattr(turn, name)))
+    return made
 
 
-class Life:
-    """One life of a node that keeps its state, and what is sent to it."""
+@pytest.fixture
+def live(make_bench, tmp_path):
+    """Begin one life of a node that keeps its state; gives it, what sends to it, and what tells
+    it a transform."""
 
-    def __init__(self, make_bench, node_type, state, *more):
-        words = [f'state_file:={state}', f"input_types:=['tf_static={ALONE}']", 'max_wait:=0.0']
-        words += more
-        self.bench = make_bench(*[word for item in words for word in ('-p', item)])
-        self.node = self.bench.add(node_type(context=self.bench.context))
+    def begin(kind, *more):
+        words = f'state_file:={tmp_path / "state"}', HEARD, 'max_wait:=0.0', *more
+        bench = make_bench(p=words)
+        node = bench.start(kind)
 
-    def send(self, topic, message, type_name, qos=None):
-        publisher = self.bench.publisher(type_name, topic, qos)
-        self.bench.send(self.node, publisher, message)
+        def send(topic, message, type_name, qos=None):
+            bench.send(node, bench.publisher(type_name, topic, qos), message)
 
-    def tell(self, *where):
-        self.send('/tf_static', transform(*where), ALONE, transforms_qos())
+        def tell(*where):
+            send('/tf_static', transform(*where), ALONE, transforms_qos())
 
-    def end(self):
-        self.bench.nodes.remove(self.node)
-        self.bench.executor.remove_node(self.node)
-        self.node.destroy_node()
+        return SimpleNamespace(node=node, send=send, tell=tell, end=lambda: bench.end(node))
 
-
-def a_ping(name):
-    made = {'obstacle': (ahead, 'approach', Detections), 'bathymetry': (swath, 'paper', Snapshot)}
-    scenes, scenario, kind = made[name]
-    scene = scenes.simulate(scenes.scenario(scenario, {}), 1)
-    ping = next(
-        item.measurement for item in scene.measurements if isinstance(item.measurement, kind)
-    )
-    entry = next(item for item in inputs_of(name) if item.measurement is kind)
-    return f'/{entry.name}', entry.write(ping, make), next(iter(entry.readers))
+    return begin
 
 
-@pytest.mark.parametrize(
-    'name, node', [('obstacle', ObstacleNode), ('bathymetry', BathymetryNode)]
-)
-def test_the_place_of_the_sonar_outlives_who_said_it(name, node, make_bench, tmp_path, capfd):
+def written(system, measurement, name):
+    """What `live` sends of a measurement for an input."""
+    entry = next(item for item in inputs_of(system) if item.name == name)
+    return entry.full_name(system), entry.write(measurement, make), next(iter(entry.readers))
+
+
+def a_fix(second, frame_id, x, y):
+    place = {'position': (x, y, 0.0), 'covariance': np.eye(2), 'frame_id': frame_id}
+    return Fix(stamp_ns=round(second * 1e9), **place)
+
+
+def test_the_place_of_the_sonar_outlives_who_said_it(live, capfd):
     frames = 'vehicle_frame:=base_link', 'sonar_frame:=sonar'
-    ping = a_ping(name)
-    first = Life(make_bench, node, tmp_path / 'state', *frames)
+    seen = Detections(stamp_ns=10**9, range=[30.0], bearing=[0.1], frame_id='sonar')
+    ping = written('obstacle', seen, 'detections')
+    first = live(ObstacleNode, *frames)
     first.send(*ping)
     assert first.node._meter.refused['no_mounting'] == 1  # nobody has said it
     first.tell('sonar', 'base_link', LEVER, RPY)
     first.send(*ping)
     assert first.node._meter.refused.total() == 1
     first.end()
-    again = Life(make_bench, node, tmp_path / 'state', *frames)
+    again = live(ObstacleNode, *frames)
     assert 'goes on from the state' in capfd.readouterr().err
     again.send(*ping)
     assert not again.node._meter.refused
@@ -105,57 +102,61 @@ def test_the_place_of_the_sonar_outlives_who_said_it(name, node, make_bench, tmp
 
 
 def test_a_place_that_was_said_before_the_node_was_there_is_heard(make_bench):
-    words = f"input_types:=['tf_static={ALONE}']", 'vehicle_frame:=base_link', 'sonar_frame:=sonar'
-    bench = make_bench(*[word for item in words for word in ('-p', item)])
+    bench = make_bench(p=[HEARD, 'vehicle_frame:=base_link', 'sonar_frame:=sonar'])
     publisher = bench.peer.create_publisher(message_class(ALONE), '/tf_static', transforms_qos())
     publisher.publish(transform('sonar', 'base_link', LEVER, RPY))
-    node = bench.add(BathymetryNode(context=bench.context))
+    node = bench.start(BathymetryNode)
     bench.spin_until(lambda: node._meter.received.total())
     assert node.tracker.config.sonar_lever == LEVER
 
 
-def test_a_track_that_was_told_and_frames_outlive_their_publishers(make_bench, tmp_path, capfd):
-    def fix_at(topic, seconds, frame_id, x, y):
-        fix = Fix(
-            stamp_ns=round(seconds * 1e9), position=(x, y, 0.0), covariance=np.eye(2),
-            frame_id=frame_id,
-        )  # fmt: skip
-        entry = next(item for item in inputs_of('diver') if item.name == topic.rpartition('/')[2])
-        return topic, entry.write(fix, make), next(iter(entry.readers))
-
-    first = Life(make_bench, DiverNode, tmp_path / 'state', 'frame_id:=map')
+def test_a_track_that_was_told_and_frames_outlive_their_publishers(live, capfd):
+    start = written('diver', a_fix(1.0, 'map', 105.0, 7.0), 'initial')
+    first = live(DiverNode, 'frame_id:=map')
+    first.send(*written('diver', a_fix(0.5, 'odom', 5.0, 7.0), 'fix'))
+    assert first.node._meter.refused['frame'] == 1
+    given = "'odom' is not the frame 'map' of the tracks, and no fixed"
+    assert given in capfd.readouterr().err
     first.tell('odom', 'map', (100.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    first.send(*fix_at('/diver/initial', 1.0, 'map', 105.0, 7.0))
+    first.send(*start)
     first.end()
-    again = Life(make_bench, DiverNode, tmp_path / 'state', 'frame_id:=map')
-    again.send(*fix_at('/fix', 2.0, 'odom', 5.5, 7.0))
+    again = live(DiverNode, 'frame_id:=map')
+    again.send(*written('diver', a_fix(2.0, 'odom', 5.5, 7.0), 'fix'))
     tracker = again.node.tracker
     known = tracker._stream.state
     assert not again.node._meter.refused
     assert track_positions(known, tracker.models)[0][:, 0] == pytest.approx([105.4], abs=0.3)
     assert known.life.track_id.tolist() == [1] and known.life.status.tolist() == [1]
-    again.send(*fix_at('/diver/initial', 1.0, 'map', 105.0, 7.0))  # it need not be told again
+    again.send(*start)  # it need not be told again
     assert len(tracker._stream.state) == 1
 
 
-def test_a_fix_in_a_frame_that_the_tree_knows_is_turned_and_another_is_refused(make_bench, capfd):
-    bench = make_bench('-p', 'frame_id:=map')
-    node = bench.add(DiverNode(context=bench.context))
-    kind = next(entry for entry in inputs_of('diver') if entry.name == 'fix')
-    type_name = next(iter(kind.readers))
-    fixes = bench.publisher(type_name, '/fix')
-    publisher = bench.publisher(ALONE, '/tf_static', transforms_qos())
+def test_places_that_were_recorded_count_offline(tmp_path):
+    """Where the sonar is, on /tf_static, and where a diver is, on /initial."""
 
-    def fix(second, frame_id):
-        place = Fix(stamp_ns=second * 10**9, position=(1.0, 2.0, 0.0), frame_id=frame_id)
-        return kind.write(evolve(place, covariance=np.eye(2)), make)
+    def run_of(system, records, parameters):
+        with BagWriter(tmp_path / system) as bag:
+            for topic, message, stamp_ns in records:
+                bag.write(topic, message, stamp_ns)
+        params = tmp_path / f'{system}.yaml'
+        params.write_text(f'{system}: {{ros__parameters: {{{parameters}}}}}')
+        words = 'track', tmp_path / system, tmp_path / f'{system}_run', '--params', params
+        assert main([str(word) for word in words]) == 0
+        return json.loads((tmp_path / f'{system}_run' / 'run.json').read_text())
 
-    bench.send(node, fixes, fix(1, 'buoy'))
-    assert node._meter.refused['frame'] == 1
-    assert "'buoy' is not the frame 'map' of the tracks, and no fixed" in capfd.readouterr().err
-    bench.send(node, publisher, transform('buoy', 'map', (100.0, 0.0, 0.0), (0.0, 0.0, 90.0)))
-    bench.send(node, fixes, fix(2, 'buoy'))
-    assert node._meter.refused['frame'] == 1
-    bench.send(node, fixes, fix(4, 'odom'))
-    assert node._meter.refused['frame'] == 2
-    assert node.tracker.counts['used'] == 1
+    pose = Pose(np.array(LEVER), geometry.rotation(*np.radians(RPY)))
+    told = write_transforms(StaticTransforms(poses={'sonar': ('base_link', pose)}), ros_message)
+    records, entries = [('/tf_static', told.transforms[0], 1)], inputs_of('obstacle')
+    for each in ahead.simulate(ahead.scenario('approach', {}), 1).measurements[:300]:
+        entry = next(e for e in entries if e.measurement is type(each.measurement))
+        message = entry.write(each.measurement, ros_message)
+        records.append((f'/{entry.name}', message, each.received_ns))
+    run = run_of('obstacle', records, 'vehicle_frame: base_link, sonar_frame: sonar')
+    assert run['mounting']['sonar_lever'] == list(LEVER) and not run['refused']
+    place = {'position': [5.0, 7.0, 0.0], 'covariance': np.eye(2)}
+    start = write_start(Start(stamp_ns=10**9, **place), ros_message)
+    fixes = [
+        ('/fix', write_fix(a_fix(k, '', 5.0 + k, 7.0), ros_message), k * 10**9) for k in (2, 3)
+    ]
+    run = run_of('diver', [('/initial', start, 10**9), *fixes], 'model_set: heading_speed')
+    assert run['topics']['/initial'] == 'initial' and run['counts']['used'] == 3

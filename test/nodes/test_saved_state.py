@@ -27,26 +27,12 @@ pytestmark = pytest.mark.usefixtures('walker')
 @pytest.fixture
 def start(make_bench, tmp_path):
     """Start a rig whose node keeps its state in `tmp_path`, with more parameters."""
-
-    def begin(*given, file='state'):
-        words = [
-            word for item in (f'state_file:={tmp_path / file}', *given) for word in ('-p', item)
-        ]
-        return Rig(make_bench(*words))
-
-    return begin
+    return lambda *given: Rig(make_bench(p=[f'state_file:={tmp_path / "state"}', *given]))
 
 
 def end(rig):
     """Stop the node, so that it saves."""
-    rig.bench.nodes.remove(rig.node)
-    rig.bench.executor.remove_node(rig.node)
-    rig.node.destroy_node()
-
-
-def kill(rig):
-    """What the file sees of a node whose process is killed."""
-    rig.node._saved_state.close()
+    rig.bench.end(rig.node)
 
 
 @pytest.mark.skipif(fcntl is None, reason='there are no locks')
@@ -73,8 +59,10 @@ def test_a_second_node_with_the_same_file_leaves_it_alone(start, tmp_path, capfd
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_node_that_is_started_again_goes_on(start, tmp_path):
+def test_a_node_that_is_started_again_goes_on_and_a_reset_is_kept(start, tmp_path):
     rig = start()
+    rig.send(a_fix(0.5, 9.0, 9.0))
+    rig.bench.call(Trigger, '/walker/reset', Trigger.Request())
     rig.send(a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0))
     end(rig)
     assert [path.name for path in tmp_path.iterdir()] == ['state']
@@ -98,17 +86,6 @@ def test_states_are_saved_while_running_and_only_when_something_was_heard(start,
     rig.bench.spin_until(lambda: ticks)
     assert (tmp_path / 'state').stat().st_mtime_ns == written
     assert read_state(tmp_path / 'state').newest_ns == 10**9
-
-
-def test_reset_is_kept_too(start):
-    rig = start()
-    rig.send(a_fix(1.0, 9.0, 9.0))
-    rig.bench.call(Trigger, '/walker/reset', Trigger.Request())
-    rig.send(a_fix(2.0, 1.0, 1.0))
-    end(rig)
-    again = start()
-    again.send(a_fix(3.0, 3.0, 3.0))
-    assert again.means() == [(3.0, 2.0, 2.0)]
 
 
 def test_files_that_cannot_be_used_are_named_and_kept(start, tmp_path, capfd):
@@ -169,7 +146,7 @@ def test_measurements_of_another_time_end_the_state_and_one_outlier_does_not(sta
     again.send(a_fix(5000.0), a_fix(1001.0, 1.0, 1.0))
     assert again.node._saved_state._loaded_ns is None
     assert again.means()[-1][0] == 5000.0 and len(again.node.tracker.fixes) == 3
-    kill(again)
+    again.node._saved_state.close()  # what the file sees of a process that is killed
     capfd.readouterr()
     other = start()
     other.send(*[a_fix(5000.0 + k, 1.0, 1.0) for k in range(4)])
@@ -204,12 +181,8 @@ def test_a_disk_that_is_full_is_said(start, monkeypatch, capfd):
 
 @pytest.mark.parametrize(
     'file, sentence',
-    [
-        ('/nowhere/at/all/state', 'there is no folder'),
-        ('~nobody-here/state', 'stands for no folder'),
-    ],
+    [('/nowhere/state', 'there is no folder'), ('~nobody-here/state', 'stands for no folder')],
 )
 def test_a_folder_that_is_not_there_ends_the_node(make_bench, file, sentence):
-    bench = make_bench('-p', f'state_file:={file}')
     with pytest.raises(ConfigError, match=sentence):
-        TrackerNode('walker', context=bench.context)
+        make_bench(p=[f'state_file:={file}']).start(TrackerNode, 'walker')

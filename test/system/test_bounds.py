@@ -6,7 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What the hardest messages may cost, each in a process of its own: docs/reliability.md.
+"""What the hardest messages may cost, each in a process of its own, for its peak of memory is one
+of a process: docs/reliability.md.
 
 The limits are a few times what was measured there: a loaded machine must not fail, what grows with
 the square of a message must.

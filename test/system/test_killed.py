@@ -11,14 +11,13 @@
 import contextlib
 import math
 import os
-from pathlib import Path
 import random
 import signal
 import subprocess
 import sys
 import time
 
-from helpers.commands import contents
+from helpers.commands import children, contents
 from helpers.dive_bags import write_dive
 from helpers.faults.figures import count
 from helpers.source import ROOT
@@ -108,9 +107,5 @@ def test_a_worker_that_is_killed_costs_a_survey_its_job_only(tmp_path):
 def _workers(command_id):
     """The processes that share the work of the command: forks of one that it has started."""
     with contextlib.suppress(OSError):  # it has ended
-        return [worker for child in _children(command_id) for worker in _children(child)]
+        return [worker for child in children(command_id) for worker in children(child)]
     return []
-
-
-def _children(pid):
-    return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]

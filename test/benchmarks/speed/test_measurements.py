@@ -51,8 +51,7 @@ def test_a_record_is_timed_with_all_its_reflectors():
     assert set(record['median_ms']) == set(record['reflectors'])
 
 
-@pytest.mark.parametrize('clutter', [0, 30])
-def test_all_obstacles_are_tracked_and_every_ping_is_timed(clutter):
-    result = obstacle.bench_ping(rounds=1, pings=16, obstacles=10, clutter=clutter)
+def test_all_obstacles_are_tracked_and_every_ping_is_timed():
+    result = obstacle.bench_ping(rounds=1, pings=16, obstacles=10, clutter=30)
     assert result['tracked'] >= 10 and result['pings'] == 6
     assert 0.0 < result['median_ms'] <= result['p99_ms']

@@ -28,12 +28,8 @@ def without_peer(rounds):
 
 @pytest.fixture
 def benches(monkeypatch):
-    """Two benches in place of those of every system."""
-    made = (
-        speed.Bench('fast', fast),
-        speed.Bench('peer', without_peer),
-    )
-    monkeypatch.setattr(speed, 'benches_of', lambda system: made)
+    """Benches in place of those of every system."""
+    return lambda *made: monkeypatch.setattr(speed, 'benches_of', lambda system: made)
 
 
 @pytest.mark.parametrize('system', SYSTEMS)
@@ -43,6 +39,7 @@ def test_benches_have_names_of_their_own(system):
 
 
 def test_the_command_measures_and_leaves_out_what_has_no_peer(benches, capsys):
+    benches(speed.Bench('fast', fast), speed.Bench('peer', without_peer))
     assert main(['bench', 'diver', '--skip-node', '--rounds', '3', '--strict']) == 0
     text = capsys.readouterr().out
     assert 'fast: rounds 3, good True' in text and 'peer left out' in text and 'filterpy' in text
@@ -51,12 +48,11 @@ def test_the_command_measures_and_leaves_out_what_has_no_peer(benches, capsys):
     assert main(['bench', 'diver', '--skip-node', '--rounds', '1', '--strict']) == 1
 
 
-def test_a_library_that_is_no_peer_is_not_left_out(monkeypatch):
+def test_a_library_that_is_no_peer_is_not_left_out(benches):
     def broken(rounds):
         raise ModuleNotFoundError('no', name='numpy_of_another_name')
 
-    bench = speed.Bench('broken', broken)
-    monkeypatch.setattr(speed, 'benches_of', lambda system: (bench,))
+    benches(speed.Bench('broken', broken))
     with pytest.raises(ModuleNotFoundError):
         main(['bench', 'diver', '--skip-node'])
 

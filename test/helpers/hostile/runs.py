@@ -192,12 +192,10 @@ def _check_nothing_lost(tracker, kept, estimates):
         if i in (None, REFUSED) or found is estimates[i] is None:
             continue
         assert found is not None and estimates[i] is not None
-        assert len(found) == len(estimates[i])
-        for first, other in zip(found, estimates[i]):
+        for first, other in zip(found, estimates[i], strict=True):
             assert first.stamp_ns == other.stamp_ns
-            np.testing.assert_array_equal(first.state, other.state)
-            np.testing.assert_array_equal(first.covariance, other.covariance)
-            np.testing.assert_array_equal(first.probabilities, other.probabilities)
+            for name in ('state', 'covariance', 'probabilities'):
+                np.testing.assert_array_equal(getattr(first, name), getattr(other, name))
 
 
 def _at(message, stamp_ns):

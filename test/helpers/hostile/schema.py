@@ -14,7 +14,6 @@ type: what no wire could bring is not tried.
 
 from __future__ import annotations
 
-from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -30,26 +29,15 @@ NUMBERS = {
 """The numpy type of each number on the wire."""
 
 
-@cache
-def definitions():
-    """The fields of every message type that an adapter reads: (name, node) by type."""
-    defined = marine.typestore().fielddefs
-    return {name: tuple(fields) for name, (_, fields) in defined.items()}
-
-
-def blank(type_name):
-    """A message of zeros."""
-    return SimpleNamespace(
-        **{name: _zero(node) for name, node in definitions()[type_name]}, __msgtype__=type_name
-    )
+def fields_of(type_name):
+    """The fields of a message type: (name, node)."""
+    return marine.typestore().fielddefs[type_name][1]
 
 
 def make(type_name, **values):
-    """A message with some fields; the factory that writers take."""
-    message = blank(type_name)
-    for name, value in values.items():
-        setattr(message, name, value)
-    return message
+    """A message with some fields, the others zero; the factory that writers take."""
+    fields = {name: _zero(node) for name, node in fields_of(type_name)}
+    return SimpleNamespace(**{**fields, **values}, __msgtype__=type_name)
 
 
 def clone(value):
@@ -63,7 +51,7 @@ def clone(value):
 
 def leaves(message):
     """Every place that holds something: (owner, name, node), lists and arrays as one."""
-    for name, node in definitions()[message.__msgtype__]:
+    for name, node in fields_of(message.__msgtype__):
         kind, detail = node
         if kind == Nodetype.NAME:
             yield from leaves(getattr(message, name))
@@ -97,7 +85,7 @@ def is_bool(node):
 def _zero(node):
     kind, detail = node
     if kind == Nodetype.NAME:
-        return blank(detail)
+        return make(detail)
     if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         inner, count = detail
         length = count if kind == Nodetype.ARRAY else 0

@@ -19,7 +19,7 @@ from rosbags.interfaces import Nodetype
 from msg_adapters.inputs import inputs_of, made_inputs
 from sonar_imm import measurements as m
 
-from .schema import blank, clone, is_many, leaves, make, number_type
+from .schema import clone, is_many, leaves, make, number_type
 
 T0 = 1_700_000_000 * 10**9
 SECOND = 10**9
@@ -190,12 +190,9 @@ def templates(system):
         for type_name in entry.readers:
             if (entry.name, type_name) in found:
                 continue
-            table = type_name.endswith('PointCloud2')
-            message = (
-                clone(next(item for (_, kind), item in found.items() if kind == type_name))
-                if table
-                else plausible(type_name)
-            )
+            message = plausible(type_name)
+            if type_name.endswith('PointCloud2'):  # any table
+                message = clone(next(m for (_, kind), m in found.items() if kind == type_name))
             if hasattr(message, 'header'):
                 message.header.frame_id = FRAMES.get((system, entry.name), 'map')
             found[entry.name, type_name] = message
@@ -240,10 +237,9 @@ _FIELDS = {
 
 def plausible(type_name):
     """A message in which no number is odd."""
-    message = blank(type_name)
+    message = make(type_name)
     _fill(message)
-    for name, value in SPECIAL.get(type_name, {}).items():
-        setattr(message, name, value)
+    vars(message).update(SPECIAL.get(type_name, {}))
     return message
 
 

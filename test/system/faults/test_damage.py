@@ -6,7 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Recordings that are damaged, disks that are full or may not be written to."""
+"""Recordings that are damaged, disks that are full or may not be written to. A limit of the size
+of files is one of a process; the rest goes into the same part of the figures."""
 
 import contextlib
 import io
@@ -89,12 +90,12 @@ def test_damage_of_a_recording_is_said_or_harmless(kind, tmp_path, figures):
 
 def limited(size, *words):
     """The command as a process that may not write files above `size` bytes, as on a full disk."""
-    return subprocess.run(
-        [sys.executable, '-m', 'sonar_imm_tools.cli', *map(str, words)],
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)),
-        capture_output=True,
-        text=True,
-    )
+    command = [sys.executable, '-m', 'sonar_imm_tools.cli', *map(str, words)]
+
+    def limit():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    return subprocess.run(command, preexec_fn=limit, capture_output=True, text=True)
 
 
 def test_a_full_disk_is_one_sentence_and_leaves_nothing_that_looks_whole(tmp_path, figures):
@@ -110,18 +111,16 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing_that_looks_whole(tmp_pat
         words = [line for line in done.stderr.splitlines() if line.startswith('sonar-imm:')]
         if done.returncode != 2 or len(words) != 1 or 'Traceback' in done.stderr or out.exists():
             bad.append((turn, done.returncode, done.stderr[-300:]))
-    figures.add(
-        {'what': 'full disk'}, tried=tries, said=tries - len(bad), silent=0, failed=len(bad)
-    )
+    said = tries - len(bad)
+    figures.add({'what': 'full disk'}, tried=tries, said=said, silent=0, failed=len(bad))
     assert not bad
 
 
 def test_a_folder_that_may_not_be_written_to_is_one_sentence(figures):
     # /sys belongs to the kernel: not even root makes a folder there
     code, message = run('track', BAGS / 'diver_table1', '/sys/sonar_imm')
-    figures.add(
-        {'what': 'read-only folder'}, tried=1, said=int(code == 2), silent=0, failed=code != 2
-    )
+    said = int(code == 2)
+    figures.add({'what': 'read-only folder'}, tried=1, said=said, silent=0, failed=1 - said)
     *before, sentence = message.splitlines()
     assert code == 2 and '/sys/sonar_imm' in sentence
     message = ('using the parameters of the recording', 'diver <- ')

@@ -8,12 +8,12 @@
 
 """Every fault of the table, done to a real node: in the short form to one node each, in turn.
 
-Queues, services, clocks and the log are those of the node as it is started.
+Queues, services, clocks and the log are those of the node as it is started: of a process.
 """
 
-from pathlib import Path
 import re
 
+from helpers.commands import children
 from helpers.faults.cases import CASES
 from helpers.faults.figures import FOLDER, long_form
 from helpers.faults.rig import LEVELS, Rig
@@ -46,11 +46,10 @@ def rigs():
     running = {}
     yield running
     for rig, _ in running.values():
-        pid = rig.node.process.pid
-        children = Path(f'/proc/{pid}/task/{pid}/children').read_text()
+        begun = children(rig.node.process.pid)
         code, log = rig.node.stop(), rig.node.log()
         rig.__exit__()
-        assert code == 0 and 'Traceback' not in log and not children
+        assert code == 0 and 'Traceback' not in log and not begun
 
 
 @pytest.mark.parametrize('fault, system', pairs(), ids=lambda item: getattr(item, 'name', item))

@@ -6,7 +6,9 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Signals at random moments of a node's life, and the start after them: they end a process."""
+"""Signals at random moments of a node's life, and the start after them: what they end is a
+process. The short form has one of a node that works for each way to end, and one node with and
+one without kernels that start; all three that ask go to these."""
 
 import contextlib
 from pathlib import Path
@@ -15,7 +17,7 @@ import subprocess
 import time
 
 from helpers.faults.cases import CASES
-from helpers.faults.figures import count
+from helpers.faults.figures import count, long_form
 from helpers.faults.rig import own_words, Rig, without_shared_memory
 import numpy as np
 import pytest
@@ -27,9 +29,13 @@ pytestmark = pytest.mark.system
 ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SYSTEMS = tuple(CASES)
 STARTING = 'while it starts'
+END_LIMIT = 300.0
+"""Seconds a node may take to end."""
 
 
-@pytest.mark.parametrize('how', [*ASKING, signal.SIGKILL], ids=lambda how: how.name)
+@pytest.mark.parametrize(
+    'how', [*ASKING[: 3 if long_form() else 1], signal.SIGKILL], ids=lambda how: how.name
+)
 def test_a_signal_at_any_moment_ends_a_busy_node_and_it_starts_again(how, figures):
     """All four nodes at once, each while it works on a burst of messages."""
     turns, unclean = count(1, 4), []
@@ -60,7 +66,7 @@ def test_a_signal_at_any_moment_ends_a_busy_node_and_it_starts_again(how, figure
     assert not unclean
 
 
-@pytest.mark.parametrize('system', SYSTEMS)
+@pytest.mark.parametrize('system', SYSTEMS if long_form() else ('fathometer', 'obstacle'))
 def test_signals_end_a_node_cleanly_at_any_moment_of_its_start(system, figures):
     """The first moment that is not the interpreter's, and others while modules load and kernels
     get warm, which takes two seconds."""
@@ -78,27 +84,16 @@ def test_signals_end_a_node_cleanly_at_any_moment_of_its_start(system, figures):
             node.process.send_signal(ASKING[turn % 3])  # as launch and a terminal do together
             unclean += reason_unclean(node, 0)
             lines = own_words(node.log()).splitlines()
-            message = [line for line in lines if '[INFO]' not in line]
-            unclean += [(system, line) for line in message]
-    figures.add(
-        {'system': system, 'signal': STARTING},
-        tried=moments,
-        clean=moments - len(unclean),
-        why=unclean,
-    )
+            unclean += [(system, line) for line in lines if '[INFO]' not in line]
+    key, clean = {'system': system, 'signal': STARTING}, moments - len(unclean)
+    figures.add(key, tried=moments, clean=clean, why=unclean)
     assert not unclean and early > 0
-
-
-END_LIMIT = 300.0
-"""Seconds a node may take to end."""
 
 
 def begun(stack, discovery):
     """Nodes that are ready."""
-    rigs = [
-        stack.enter_context(Rig(CASES[system], connected=False, discovery=discovery))
-        for system in SYSTEMS
-    ]
+    begin = [Rig(CASES[system], connected=False, discovery=discovery) for system in SYSTEMS]
+    rigs = [stack.enter_context(each) for each in begin]
     for rig in rigs:
         rig.connect()
     return rigs
