@@ -15,7 +15,6 @@ from helpers import marine
 from helpers.marine import driver_message
 import numpy as np
 import pytest
-from sonar_imm_tools.recordings.topics import fitting_topics
 
 from msg_adapters.arrivals import write_arrivals
 from msg_adapters.fixes import write_fix, write_geodetic
@@ -30,7 +29,7 @@ from sonar_imm_tools.offline.inspection import inspect
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.offline.tracking import InputOptions, OfflineRun, write_run
 from sonar_imm_tools.recordings import positions
-from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.measurements import fitting_topics, measurements_of
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.positions import GAP_S
 from sonar_imm_tools.recordings.reader import BagError, BagReader
