@@ -277,17 +277,23 @@ def write_bag(
     ordered = sorted((each for each in packed if each[0] not in off), key=itemgetter(0))
     if not ordered or (needed and all(topic != needed for _, topic, *_ in ordered)):
         raise report.nothing(source)
-    notes = provenance(source, report.notes)
-    if named := {str(number): name for name, number in report.target_names.items()}:
-        notes[TARGET_NAMES] = json.dumps(named, ensure_ascii=False)
-    with BagWriter(
-        report.path, storage=how.storage, custom_data=notes, parameters=parameters
-    ) as bag:
+    with new_bag(report, source, how, parameters) as bag:
         for stamp_ns, topic, kind, raw in ordered:
             bag.write_raw(topic, kind, raw, stamp_ns)
-            report.messages[topic] += 1
 
 
-def provenance(source: str, notes: Mapping[str, str]) -> dict[str, str]:
-    """What a converted bag notes beside its messages."""
-    return {'source': source, 'converted_by': 'sonar-imm convert', **notes}
+@contextmanager
+def new_bag(
+    report: ConversionReport,
+    source: str,
+    how: Any,
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+) -> Iterator[BagWriter]:
+    """Open the bag of a report, which has its notes and counts its messages, for writing."""
+    notes = {'source': source, 'converted_by': 'sonar-imm convert', **report.notes}
+    if named := {str(number): name for name, number in report.target_names.items()}:
+        notes[TARGET_NAMES] = json.dumps(named, ensure_ascii=False)
+    place, storage = report.path, how.storage
+    with BagWriter(place, storage=storage, custom_data=notes, parameters=parameters) as bag:
+        report.messages = bag.counts
+        yield bag

@@ -84,7 +84,6 @@ def option(default: Any, metavar: str, help: str, **more: Any) -> Any:
 
 
 def group(options: type, prefix: str = '', what: str = 'the input') -> Any:
-    """A field that is a group of options."""
     return field(factory=options, metadata={_KEY: Group(options, prefix, what)})
 
 

@@ -313,7 +313,6 @@ class McapScan:
                 yield channel, log_ns, self._chunk(block)[start : start + length]
 
     def close(self) -> None:
-        """Close the file."""
         self._chunk.cache_clear()
         self._file.close()
 
@@ -334,7 +333,6 @@ class McapScan:
                 (self.stated,) = struct.unpack_from('<Q', content)
 
     def _walk_chunks(self) -> None:
-        """Walk the chunks of the index."""
         for position, length in sorted(self._lengths.items()):
             self._file.seek(position)
             if self._file.read(RECORD.size) != RECORD.pack(CHUNK, length):
@@ -401,7 +399,6 @@ class McapScan:
         return content
 
     def _take(self, code: int, content: bytes, block: int, start: int) -> None:
-        """Note one schema, channel or message."""
         try:
             if code == MESSAGE:
                 channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(content)

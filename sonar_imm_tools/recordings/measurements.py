@@ -402,7 +402,6 @@ def knows_inputs(system: str, names: Collection[str]) -> bool:
 
 
 def _mapped(bag: BagReader, system: str, name: str, wanted: str) -> InputTopic:
-    """Check one entry of a topic map."""
     entries = {entry.name: entry for entry in every_input(system)}
     if wanted not in entries:
         raise BagError(

@@ -90,7 +90,6 @@ def _cast(kind: Any, value: Any) -> Any:
 
 
 def _default(kind: Any) -> Any:
-    """Give the zero or empty value of a field."""
     node, detail = kind
     if node == Nodetype.NAME:
         return ros_message(detail)

@@ -6,7 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Positions of CSV rows in local metres: from latitude and longitude, or by range and bearing."""
+"""Positions of CSV rows in local metres: from latitude and longitude, or by range and bearing.
+
+Which of these a table holds, in which units, is asked of the same cells: so all are in one place.
+"""
 
 from __future__ import annotations
 

@@ -105,7 +105,6 @@ class BagReader:
         self.close()
 
     def close(self) -> None:
-        """Close the files."""
         while self._sources:
             self._sources.pop().close()
 

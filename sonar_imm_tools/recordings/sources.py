@@ -9,7 +9,7 @@
 """Sources of recorded messages: rosbags for whole files, a scan of the records for damaged ones.
 
 rosbags raises many kinds of exception on damaged files. Each becomes a `BagError` or a problem of
-one sentence here.
+one sentence here, in both sources alike, with what each falls back on.
 """
 
 from __future__ import annotations
@@ -147,7 +147,6 @@ class RosbagsSource:
         return [getattr(reader, 'storage', None) for reader in self._reader.readers]
 
     def _mcaps(self) -> list[Path]:
-        """Its files of that kind."""
         if self._path.is_dir():
             return sorted(self._path.glob('*.mcap'))
         return [self._path] if self._path.suffix == '.mcap' else []

@@ -9,7 +9,7 @@
 """Tables of any origin: any names of columns, any unit of time.
 
 Columns are found by their usual names (`columns`); columns with other names are mapped by hand.
-A row that cannot be read raises `BadRow`.
+A row that cannot be read raises `BadRow`. Rows and their table need each other, so both are here.
 """
 
 from __future__ import annotations

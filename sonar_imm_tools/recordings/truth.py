@@ -160,5 +160,5 @@ def write_scene(
     ) as bag:
         for log_ns, topic, message in sorted(records, key=lambda record: record[0]):
             bag.write(topic, message, log_ns)
-            report.messages[topic] += 1
+    report.messages = bag.counts
     return report

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 import contextlib
 import os
@@ -91,7 +92,7 @@ class BagWriter:
         if storage not in STORAGES:
             raise ValueError(f"storage must be one of {', '.join(STORAGES)}, got '{storage}'")
         self.path = Path(path)
-        self.count = 0
+        self.counts: Counter[str] = Counter()
         self._links: dict[tuple[str, str], Connection] = {}
         self._chunk: tuple[int, int] | None = None
         self._parameters = {} if parameters is None else parameters
@@ -149,7 +150,7 @@ class BagWriter:
         with naming(self.path):
             self._writer.write(self._link(topic, type_name), log_ns, raw)
             self._close_chunk(log_ns, len(raw))
-        self.count += 1
+        self.counts[topic] += 1
 
     def _close_chunk(self, log_ns: int, size: int) -> None:
         """Close the chunk of an MCAP file after a message of `size` bytes, if it is time."""

@@ -12,7 +12,7 @@ elsewhere; traces also as CSV.
 The arrays of snapshots are found by their usual names (`NAMES`); other names can be given. Needed
 are the complex samples, (bins, staves) for one ping or (pings, bins, staves), and the range or the
 two-way time of each bin. Where the archive also has the true floor, with the height and tilt of
-the sonar, it goes to ``/truth/estimate``.
+the sonar, it goes to ``/truth/estimate``. Both kinds of archive are opened and dated alike.
 """
 
 from __future__ import annotations
@@ -353,8 +353,8 @@ def _from_table(report: ConversionReport, table: CsvTable, frame_id: str) -> lis
     rows = report.read_rows(table, parse)
     for stamp, group in groupby(rows, key=lambda pair: pair[1][0]):
         lines = list(group)
-        depth, amplitude, sigma = np.array([sample[1:] for _, sample in lines]).T
-        given = {'depth': depth, 'amplitude': amplitude, 'sigma': sigma}
+        samples = np.array([sample[1:] for _, sample in lines]).T
+        given = dict(zip(('depth', 'amplitude', 'sigma'), samples))
         with report.leaving_out(table.path, f'trace from line {lines[0][0].line}'):
             trace = Trace(stamp_ns=stamp, frame_id=frame_id, **given)
             records.append((stamp, '/trace', write_trace(trace, ros_message)))

@@ -153,7 +153,6 @@ def write_pings(
 
 
 def _parse(row: Row, places: Places, senders: Places | None, default: float) -> Arrival:
-    """Read one line of the arrivals."""
     row.require_valid()
     passive = senders is None
     receiver, transmitter = row.text('receiver'), '' if passive else row.text('transmitter')

@@ -44,7 +44,7 @@ from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm.trackers.fathometer.water import measure_line
 
 from ... import SECOND
-from ..conversion import ConversionReport, converter, provenance, Record, write_bag
+from ..conversion import ConversionReport, converter, new_bag, Record, write_bag
 from ..convert_options import HydrophonesOptions, SegyOptions
 from ..messages import ros_message
 from ..positions import write_position
@@ -134,7 +134,6 @@ class Window(NamedTuple):
 
 
 def _windows(line: SegyLine, how: SegyOptions) -> list[Window]:
-    """Return the windows of the line, in order."""
     spacing = line.spacing(how.sound_speed, how.sample_spacing)
     first = line.first_depth(how.sound_speed, how.depth_offset)
     begins = np.flatnonzero((np.diff(spacing) != 0.0) | (np.diff(first) != 0.0)) + 1
@@ -277,15 +276,13 @@ def convert_hydrophones(path: Path, how: HydrophonesOptions, report: ConversionR
                 f'{path.name} is shorter than it says of itself; what is there is kept'
             )
         report.notes['full scale'] = f'{how.full_scale:g} Pa'
-        notes = provenance(path.name, report.notes)
         own = {'fathometer': {'phones': len(channels)}}
-        with BagWriter(report.path, storage=how.storage, custom_data=notes, parameters=own) as bag:
+        with new_bag(report, path.name, how, own) as bag:
             _write_blocks(audio, bag, report, how, channels, start_ns, rows)
-            if not bag.count:
+            if not bag.counts:
                 raise report.nothing(path)
             for stamp_ns, topic, message in places:
                 bag.write(topic, message, stamp_ns)
-                report.messages[topic] += 1
 
 
 def _write_blocks(
@@ -321,7 +318,6 @@ def _write_blocks(
                 scale=scale,
             )
             bag.write('/pressure', write_pressure(block, ros_message), stamp_ns)
-            report.messages['/pressure'] += 1
 
 
 def _channels(audio: soundfile.SoundFile, wanted: Sequence[int] | None) -> list[int]:

@@ -35,7 +35,7 @@ from msg_adapters.snapshots import FIELDS, snapshot_of_phase, snapshot_of_staves
 from sonar_imm.measurements import MAX_IMAGE_CELLS, Rejection, Snapshot, SonarImage
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
 
-from ..conversion import ConversionReport, converter, provenance
+from ..conversion import ConversionReport, converter, new_bag
 from ..convert_options import ImagesOptions, InterferometerOptions, PicturesOptions
 from ..measurements import DetectedImages, made_topics, types_of
 from ..messages import ros_message
@@ -45,7 +45,6 @@ from ..sources import BagError
 from ..table_files import CsvTable
 from ..tables import Row
 from ..times import BadRow
-from ..writer import BagWriter
 from .navigation import Message, Record, write_records
 
 SYSTEM = 'obstacle'
@@ -71,12 +70,11 @@ def convert_images(path: Path, how: ImagesOptions, report: ConversionReport) -> 
             message = made(item.message)
             return None if message is None else (f'/{name}', message)
 
-        _write_from_bag(bag, sorted({name for name, _ in makers}), make, report, how.storage)
+        _write_from_bag(bag, sorted({name for name, _ in makers}), make, report, how)
         report.problems += bag.problems
 
 
 def _image_topic(bag: BagReader, wanted: str | None) -> str:
-    """The topic with the images."""
     entry = made_inputs(SYSTEM)[0]
     if wanted is not None:
         if not any(t.name == wanted and t.type_name in entry.readers for t in bag.topics):
@@ -177,7 +175,7 @@ def convert_interferometer(
                 given_up += 1
             return None
 
-        _write_from_bag(bag, [*set(topics), *beside], make, report, how.storage)
+        _write_from_bag(bag, [*set(topics), *beside], make, report, how)
         if lonely := given_up + len(waiting):
             report.bad_rows += lonely
             report.problems.append(
@@ -191,22 +189,19 @@ def _write_from_bag(
     topics: Collection[str],
     make: Callable[[BagMessage], Message | None],
     report: ConversionReport,
-    storage: str,
+    how: Any,
 ) -> None:
     """Write a new bag of messages of another one, in recorded order and with their times. make:
     topic and message for one of `bag`, or None where there is none yet; those for which it raises
     `Rejection` are counted and named."""
-    notes = provenance(bag.path.name, report.notes)
-    with BagWriter(report.path, storage=storage, custom_data=notes) as made:
+    with new_bag(report, bag.path.name, how) as made:
         for item in bag.messages(topics):
             report.rows += 1
             written = None
             with report.leaving_out(bag.path, f'{item.topic} #{item.index}'):
                 written = make(item)
             if written is not None:
-                topic, message = written
-                made.write(topic, message, item.log_ns)
-                report.messages[topic] += 1
+                made.write(*written, item.log_ns)
 
 
 def _companion_topics(bag: BagReader, wanted: Mapping[str, InputTopic]) -> dict[str, str]:
@@ -280,10 +275,7 @@ def _picture_row(row: Row, degrees: Degrees | None, how: PicturesOptions) -> Rec
         'units': 'metres' if degrees is None else 'degrees',
         'place': place,
         'heading': row.optional('heading'),
-        'pitch': math.nan,
-        'roll': math.nan,
         'depth': -row.height(),
-        'altitude': math.nan,
     }
 
 

@@ -33,7 +33,7 @@ from sonar_imm.acoustics.geometry import quaternion
 from sonar_imm.measurements import Altitude, Navigation
 
 from ... import SECOND
-from ..conversion import ConversionReport, flags_of, JUMP, Leaps, provenance
+from ..conversion import ConversionReport, flags_of, JUMP, Leaps, new_bag
 from ..conversion import Record as Stamped
 from ..messages import ros_message
 from ..places import ask_for_angle, Degrees, origin_parameters, TURN
@@ -42,12 +42,12 @@ from ..sources import BagError
 from ..table_files import CsvTable
 from ..tables import CsvOptions, Row
 from ..times import BadRow
-from ..writer import BagWriter
 
 LATEST = 2**31 * SECOND
 _SYSTEMS = {'detections': 'obstacle', 'snapshot': 'bathymetry'}
 Record = dict[str, Any]
-"""What a reader says of a ping or a picture; see `xtf.pings_of`."""
+"""What a reader says of a ping or picture, as in `xtf.pings_of`; attitude, depth and altitude are
+left out where they are not known."""
 
 
 Message = tuple[str, Any]
@@ -83,7 +83,7 @@ class Frame:
         self.leaps.saw(record['stamp_ns'], east, north)
         depth, pitch, roll = (
             value if math.isfinite(value) else 0.0
-            for value in (record['depth'], record['pitch'], record['roll'])
+            for value in (record.get(name, math.nan) for name in ('depth', 'pitch', 'roll'))
         )
         # ENU from FLU, of degrees from north to the east, bow up, starboard down.
         angles = roll, -pitch, 90.0 - record['heading']
@@ -123,9 +123,8 @@ def write_records(
     """Write the messages of each record and where the ship was. Raises `BagError` when there is
     none."""
     frame = Frame()
-    notes = provenance(path.name, report.notes)
     own = {} if parameters is None else parameters
-    with BagWriter(report.path, storage=how.storage, custom_data=notes, parameters=own) as bag:
+    with new_bag(report, path.name, how, own) as bag:
         for record in _in_time(records, path, report):
             stamp_ns = record['stamp_ns']
             nav, made = None, []
@@ -138,7 +137,6 @@ def write_records(
                 made = [*navigation_messages(record, nav), *made]
             for topic, message in made:
                 bag.write(topic, message, stamp_ns)
-                report.messages[topic] += 1
         if place := frame.parameters():
             for topic in report.messages:
                 if system := _SYSTEMS.get(topic.rpartition('/')[2]):
@@ -151,7 +149,7 @@ def write_records(
 def navigation_messages(record: Record, navigation: Navigation) -> Iterator[Message]:
     """Yield where the ship was and, if the record states it, its altitude."""
     yield '/nav', write_navigation(navigation, ros_message)
-    altitude = float(record['altitude'])
+    altitude = float(record.get('altitude', math.nan))
     if altitude > 0.0 and math.isfinite(altitude):
         measured = Altitude(stamp_ns=record['stamp_ns'], altitude=altitude, frame_id='sonar')
         yield '/altitude', write_range(measured, ros_message)
@@ -241,7 +239,6 @@ def navigation_of_table(
                 'place': place,
                 'stamp_ns': row.stamp_ns(),
                 'units': 'degrees' if geodetic else 'metres',
-                'altitude': math.nan,
             }
 
         rows = [record for _, record in report.read_rows(table, parse)]
@@ -271,13 +268,10 @@ def navigation_of_arrays(
     geodetic = {'latitude', 'longitude'} <= values.keys()
     if not geodetic and not {'x', 'y'} <= values.keys():
         return []
-    nothing = np.full(count, math.nan)
-    columns = {
-        'heading': _heading(values, path),
-        'depth': -values['z'] if 'z' in values else values.get('depth', nothing),
-        **{name: _attitude(values, name, path) for name in ('roll', 'pitch')},
-        'altitude': values.get('altitude', nothing),
-    }
+    columns = {'heading': _heading(values, path)}
+    columns |= {name: values[name] for name in ('depth', 'altitude') if name in values}
+    columns |= {'depth': -values['z']} if 'z' in values else {}
+    columns |= {name: _attitude(values, name, path) for name in ('roll', 'pitch')}
     units, axes = ('degrees', ('longitude', 'latitude')) if geodetic else ('metres', ('x', 'y'))
     records = (
         {'stamp_ns': stamp, 'units': units, 'place': tuple(values[axis][k] for axis in axes)}

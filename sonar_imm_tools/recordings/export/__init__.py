@@ -39,7 +39,6 @@ class CsvWriter:
         self._writer = csv.writer(file, lineterminator='\n')
 
     def write(self, cells: Iterable[object]) -> None:
-        """Write one row."""
         self._writer.writerow([in_cell(c) if isinstance(c, str) else c for c in cells])
 
     def write_columns(self, columns: Sequence[NDArray]) -> None:
@@ -72,7 +71,6 @@ def _arrow() -> Any:
 
 
 def _rows(columns: Sequence[NDArray]) -> str:
-    """Lines of columns (n,) of numbers."""
     arrow = _arrow()
     texts = {str(k): _texts(column, arrow) for k, column in enumerate(columns)}
     form = arrow.csv.WriteOptions(include_header=False, quoting_style='none')
