@@ -45,7 +45,7 @@ else:
 
 MAGIC = b'\x89MCAP0\r\n'
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX = 0x02, 0x03, 0x04, 0x05, 0x06, 0x08
-STATISTICS, SUMMARY_OFFSET, DATA_END = 0x0B, 0x0E, 0x0F
+STATISTICS, DATA_END = 0x0B, 0x0F
 RECORD = struct.Struct('<BQ')
 _CHUNK_HEAD = struct.Struct('<QQQI')
 _FOOTER = struct.Struct('<BQQQI')
@@ -284,7 +284,7 @@ class McapScan:
         self._lengths: dict[int, int] = {}
         self._schemas: dict[int, tuple[str, str, str]] = {}
         # Log time, channel, block, start and length of each message.
-        self._messages = tuple(map(array, 'QHqQQ'))
+        self._messages: tuple[array[int], ...] = tuple(array(code) for code in 'QHqQQ')
         self._chunk = lru_cache(maxsize=2)(self._read_chunk)
         try:
             if self._file.read(len(MAGIC)) != MAGIC:

@@ -28,95 +28,6 @@ from .messages import ros_message
 from .reader import BagReader
 from .sources import BagError, TopicInfo
 
-
-class Received(NamedTuple):
-    """What one message gave: a measurement, the `Rejection` that says why there is none, or None
-    when it takes more messages to make one."""
-
-    topic: str
-    measurement: Any
-    log_ns: int
-
-
-def measurements_of(
-    bag: BagReader,
-    system: str,
-    topics: Mapping[str, str] | None = None,
-    *,
-    world_frame: str = 'enu',
-    order: str = 'recorded',
-    settings: Mapping[str, Any] | None = None,
-    detector: Mapping[str, Any] | None = None,
-) -> Iterator[Received]:
-    """Yield the measurements for the tracker `system` in an open recording, in replay order.
-
-    `topics` is as in `fitting_topics`, `world_frame` (``'enu'`` or ``'ned'``) is what the
-    recording uses, `order` is as in `BagReader.messages`. `settings` holds the parameters of the
-    tracker by name; readers take those that concern them. `detector` holds the parameters of the
-    detector of images that are not the default. Messages that deserve a warning are
-    counted in ``bag.problems`` at the end. Raises `BagError` when no topic fits.
-    """
-    chosen = fitting_topics(bag, system, topics)
-    known = settings or {}
-    images = DetectedImages(system, detector or {}, known)
-    readers = {
-        (name, type_name): images.reader(entry, type_name)
-        if entry.makes
-        else entry.reader(type_name, world_frame, known, name)
-        for name, entry in chosen.items()
-        for type_name in entry.readers
-    }
-    doubts: Counter[tuple[str, str]] = Counter()
-    for item in bag.messages(list(chosen), order=order):
-        entry = chosen[item.topic]
-        if item.type_name not in entry.readers:  # one topic name recorded with two types
-            sentence = f'{item.topic} carries {item.type_name}, not readable as {entry.name}'
-            yield Received(item.topic, Rejection('bad_type', sentence), item.log_ns)
-            continue
-        try:
-            measurement = readers[item.topic, item.type_name](item.message)
-            if (code := entry.doubt(item.message, measurement)) is not None:
-                doubts[item.topic, code] += 1
-        except Rejection as rejection:
-            measurement = rejection
-        yield Received(item.topic, measurement, item.log_ns)
-    for (topic, code), count in doubts.items():
-        bag.add_problem(f'topic {topic}: {count} messages {DOUBTS.get(code, code)}')
-
-
-class DetectedImages:
-    """Reads recorded images as detections, in recorded order, as the live detector does.
-
-    Live, a message lies between detector and tracker, whose columns of four bytes round. So the
-    offline tracker takes the detections through such a message too, and both have the same bits.
-    """
-
-    def __init__(self, system: str, detector: Mapping[str, Any], settings: Mapping[str, Any]):
-        """detector: parameters of `DetectorConfig` that are not the default; settings: parameters
-        of the tracker, by name. Raises `ConfigError`."""
-        self._inputs = {entry.name: entry for entry in inputs_of(system)}
-        self._settings = settings
-        self._config = DetectorConfig.from_mapping(detector)
-        self._detector = ImageDetector(self._config)
-
-    def reader(self, entry: InputTopic, type_name: str) -> Callable[[Any], Detections | None]:
-        """The reader of one topic, of images or beside them: from a message to detections, None
-        while a scanning sonar is at its sweep. It raises `Rejection`."""
-        made = self._inputs[entry.makes]
-        read = entry.reader(type_name, 'enu', self._config.as_dict())
-        again = made.reader('sensor_msgs/msg/PointCloud2', 'enu', self._settings)
-
-        def detections(message: Any) -> Detections | None:
-            image = read(message)
-            if isinstance(image, SonarInfo):
-                self._detector.describe(image)
-                return None
-            found = self._detector.process(image)
-            return None if found is None else again(made.write(found, ros_message))
-
-        return detections
-
-
 TYPES_NAMED = 3
 Topics = Mapping[str, str] | None
 """Input names by topic name that a user chose, as in `fitting_topics`."""
@@ -452,3 +363,91 @@ def types_heard(system: str) -> str:
     entries = [entry for entry in inputs_of(system) if not entry.companion][:TYPES_NAMED]
     takes = [f'{entry.name} takes {", ".join(entry.readers)}' for entry in entries]
     return f'. None is of a type that is heard: {"; ".join(takes)}'
+
+
+class Received(NamedTuple):
+    """What one message gave: a measurement, the `Rejection` that says why there is none, or None
+    when it takes more messages to make one."""
+
+    topic: str
+    measurement: Any
+    log_ns: int
+
+
+def measurements_of(
+    bag: BagReader,
+    system: str,
+    topics: Topics = None,
+    *,
+    world_frame: str = 'enu',
+    order: str = 'recorded',
+    settings: Mapping[str, Any] | None = None,
+    detector: Mapping[str, Any] | None = None,
+) -> Iterator[Received]:
+    """Yield the measurements for the tracker `system` in an open recording, in replay order.
+
+    `topics` is as in `fitting_topics`, `world_frame` (``'enu'`` or ``'ned'``) is what the
+    recording uses, `order` is as in `BagReader.messages`. `settings` holds the parameters of the
+    tracker by name; readers take those that concern them. `detector` holds the parameters of the
+    detector of images that are not the default. Messages that deserve a warning are
+    counted in ``bag.problems`` at the end. Raises `BagError` when no topic fits.
+    """
+    chosen = fitting_topics(bag, system, topics)
+    known = settings or {}
+    images = DetectedImages(system, detector or {}, known)
+    readers = {
+        (name, type_name): images.reader(entry, type_name)
+        if entry.makes
+        else entry.reader(type_name, world_frame, known, name)
+        for name, entry in chosen.items()
+        for type_name in entry.readers
+    }
+    doubts: Counter[tuple[str, str]] = Counter()
+    for item in bag.messages(list(chosen), order=order):
+        entry = chosen[item.topic]
+        if item.type_name not in entry.readers:  # one topic name recorded with two types
+            sentence = f'{item.topic} carries {item.type_name}, not readable as {entry.name}'
+            yield Received(item.topic, Rejection('bad_type', sentence), item.log_ns)
+            continue
+        try:
+            measurement = readers[item.topic, item.type_name](item.message)
+            if (code := entry.doubt(item.message, measurement)) is not None:
+                doubts[item.topic, code] += 1
+        except Rejection as rejection:
+            measurement = rejection
+        yield Received(item.topic, measurement, item.log_ns)
+    for (topic, code), count in doubts.items():
+        bag.add_problem(f'topic {topic}: {count} messages {DOUBTS.get(code, code)}')
+
+
+class DetectedImages:
+    """Reads recorded images as detections, in recorded order, as the live detector does.
+
+    Live, a message lies between detector and tracker, whose columns of four bytes round. So the
+    offline tracker takes the detections through such a message too, and both have the same bits.
+    """
+
+    def __init__(self, system: str, detector: Mapping[str, Any], settings: Mapping[str, Any]):
+        """detector: parameters of `DetectorConfig` that are not the default; settings: parameters
+        of the tracker, by name. Raises `ConfigError`."""
+        self._inputs = {entry.name: entry for entry in inputs_of(system)}
+        self._settings = settings
+        self._config = DetectorConfig.from_mapping(detector)
+        self._detector = ImageDetector(self._config)
+
+    def reader(self, entry: InputTopic, type_name: str) -> Callable[[Any], Detections | None]:
+        """The reader of one topic, of images or beside them: from a message to detections, None
+        while a scanning sonar is at its sweep. It raises `Rejection`."""
+        made = self._inputs[entry.makes]
+        read = entry.reader(type_name, 'enu', self._config.as_dict())
+        again = made.reader('sensor_msgs/msg/PointCloud2', 'enu', self._settings)
+
+        def detections(message: Any) -> Detections | None:
+            image = read(message)
+            if isinstance(image, SonarInfo):
+                self._detector.describe(image)
+                return None
+            found = self._detector.process(image)
+            return None if found is None else again(made.write(found, ros_message))
+
+        return detections

@@ -22,8 +22,8 @@ from rosbags.typesys.store import Typestore
 _NUMBERS = 'bool float32 float64 int8 int16 int32 int64 uint8 uint16 uint32 uint64'.split()
 _DTYPES = {name: np.dtype(name) for name in _NUMBERS}
 _DTYPES |= dict.fromkeys(('octet', 'byte', 'char'), np.dtype(np.uint8))
-_SCALARS = {name: {'b': bool, 'f': float}.get(each.kind, int) for name, each in _DTYPES.items()}
-_SCALARS |= {'string': str, 'wstring': str}
+_SCALARS: dict[str, type] = {'string': str, 'wstring': str}
+_SCALARS |= {name: {'b': bool, 'f': float}.get(each.kind, int) for name, each in _DTYPES.items()}
 
 
 @cache

@@ -231,7 +231,9 @@ def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str] | str]:
             if tag == 'name' and names:
                 names[-1] = names[-1] or (element.text or '').strip()
             elif tag in ('trkpt', 'rtept', 'wpt'):
-                yield _gpx_point(element, names[-1] if names else '')
+                own = _text(element, 'name') if tag == 'wpt' else (names or [''])[-1]
+                place = (element.get('lat', ''), element.get('lon', ''), _text(element, 'ele'))
+                yield dict(zip(PLACE, (_text(element, 'time'), *place, own)))
                 element.clear()
             elif tag == 'Placemark':
                 points = list(_placemark(marks.pop(), names.pop()))
@@ -263,12 +265,6 @@ def _text(element: ElementTree.Element, tag: str) -> str:
     return next(found, '').strip()
 
 
-def _gpx_point(point: ElementTree.Element, name: str) -> dict[str, str]:
-    place = (point.get('lat', ''), point.get('lon', ''), _text(point, 'ele'))
-    own = _text(point, 'name') if point.tag.endswith('wpt') else name
-    return dict(zip(PLACE, (_text(point, 'time'), *place, own)))
-
-
 def _placemark(
     placemark: ElementTree.Element, name: str, cut: bool = False
 ) -> Iterator[dict[str, str]]:
@@ -277,19 +273,15 @@ def _placemark(
     times, places = [], []
     for part in placemark.iter():
         tag, text = part.tag.rpartition('}')[2], (part.text or '').strip()
-        if tag == 'when':
-            times.append(text)
-        elif tag == 'coord':
-            places.append(text.split())
-        elif tag == 'coordinates':
-            places += [place.split(',') for place in text.split()]
+        times += [text] if tag == 'when' else []
+        places += [text.split()] if tag == 'coord' else []
+        places += [place.split(',') for place in text.split()] if tag == 'coordinates' else []
     if len(times) != len(places) and not (cut and len(times) > 1):
         times = times * len(places) if len(times) == 1 else [''] * len(places)
     for time, place in zip(times, places):
-        if len(place) < 2:
-            continue
-        longitude, latitude, *height = place
-        yield dict(zip(PLACE, (time, latitude, longitude, height[0] if height else '', name)))
+        if len(place) >= 2:
+            longitude, latitude, height = (*place, '')[:3]
+            yield dict(zip(PLACE, (time, latitude, longitude, height, name)))
 
 
 def _read_geojson(path: Path) -> Iterator[dict[str, str] | str]:

@@ -43,10 +43,9 @@ def records_of(true: Truth, frame_id: str) -> list[Record]:
     prefix, _, name = TRUTH_TOPIC.rpartition('/')
     records = []
     for table in true.tables(frame_id):
-        head = {'stamp_ns': table.stamp_ns, 'frame_id': table.frame_id}
-        message = encode_table(table.columns, **head, make=ros_message)
-        topic = prefix + namespaced(table.namespace, f'/{name}')
-        records.append((table.stamp_ns, topic, message))
+        columns, stamp, frame = table.columns, table.stamp_ns, table.frame_id
+        message = encode_table(columns, stamp_ns=stamp, frame_id=frame, make=ros_message)
+        records.append((stamp, prefix + namespaced(table.namespace, f'/{name}'), message))
     return records
 
 

@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 import math
 from pathlib import Path
+from typing import Any
 import zipfile
 import zlib
 
@@ -210,7 +211,7 @@ def _snapshot(
     ping: int,
     stamp: int,
     iq: NDArray,
-    constants: Mapping[str, float | None],
+    constants: Mapping[str, Any],
     frame_id: str,
 ) -> Snapshot:
     bins = len(iq)

@@ -295,10 +295,9 @@ def _take(log: _Log, sentence: Any, stamp: int | None) -> None:
     if not kind:  # of a maker
         log.unread[sentence.identifier()] += 1
         return
+    day: Any = getattr(sentence, 'datestamp', None) if kind != 'ZDA' else None
     if kind == 'ZDA':
         day = Date(int(sentence.year), int(sentence.month), int(sentence.day))
-    else:
-        day = getattr(sentence, 'datestamp', None)
     if isinstance(day, Date) and day != log.day:
         log.day, log.of_day = day, None
     clock = getattr(sentence, 'timestamp', None)
@@ -321,9 +320,13 @@ def _take(log: _Log, sentence: Any, stamp: int | None) -> None:
         log.hears = True
         row = _row(log.now(), sentence.latitude, sentence.longitude)
         log.targets.append(row | {'id': str(sentence.target_name or sentence.target_number)})
-    elif kind == 'TTM':
+    elif kind == 'TTM':  # by distance and bearing from the vessel
         log.hears = True
-        _take_tracked(log, sentence)
+        bearing = float(sentence.bearing) + (log.bow() if sentence.brg_ref == 'R' else 0.0)
+        distance = float(sentence.distance) * LENGTHS.get(sentence.dist_unit or 'N', math.nan)
+        angle = math.radians(bearing)
+        away = np.array([distance * math.sin(angle), distance * math.cos(angle), 0.0])
+        _take_target(log, away, str(sentence.name or sentence.target_number))
     elif not isinstance(day, Date):
         log.unread[kind] += 1
 
@@ -395,17 +398,6 @@ def _take_heading(log: _Log, degrees: float, roll: float = 0.0, pitch: float = 0
             stamp_ns=stamp_ns, orientation=np.array(quaternion(*angles)), frame_id='vessel'
         )
     )
-
-
-def _take_tracked(log: _Log, sentence: Any) -> None:
-    """A target by distance and bearing from the vessel, placed from its last position."""
-    bearing = float(sentence.bearing)
-    if sentence.brg_ref == 'R':
-        bearing += log.bow()
-    distance = float(sentence.distance) * LENGTHS.get(sentence.dist_unit or 'N', math.nan)
-    angle = math.radians(bearing)
-    away = np.array([distance * math.sin(angle), distance * math.cos(angle), 0.0])
-    _take_target(log, away, str(sentence.name or sentence.target_number))
 
 
 def _take_target(log: _Log, away: FloatArray, name: str) -> None:

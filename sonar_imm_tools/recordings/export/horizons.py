@@ -94,13 +94,14 @@ def picks_of(
     if not rows:
         raise BagError('there are no reflectors to export')
     rows.sort(key=lambda row: row[0])
-    places = np.array([where for where, _ in rows], np.int64).T
-    values = np.array([numbers for _, numbers in rows]).T
+    horizon, record, stamp_ns = np.array([where for where, _ in rows], np.int64).T
+    two_way_time, depths, stds, *copied = np.array([numbers for _, numbers in rows]).T
     east = north = np.full(len(stamps), np.nan)
     if positions is not None:
         east, north = positions.at(np.array(stamps, np.int64))
-    line = (column[places[1] - 1] for column in (east, north, _along(east, north)))
-    return Picks(*places, *values[:3], dict(zip(_COPIED, values[3:])), *line)
+    line = (column[record - 1] for column in (east, north, _along(east, north)))
+    extra = dict(zip(_COPIED, copied))
+    return Picks(horizon, record, stamp_ns, two_way_time, depths, stds, extra, *line)
 
 
 def _along(longitude: FloatArray, latitude: FloatArray) -> FloatArray:

@@ -140,8 +140,8 @@ def _rows(estimate: Estimate) -> dict[str, NDArray[Any]]:
     probabilities = np.column_stack([column(name) for name in models])
     rows['model'] = labels[np.argmax(np.nan_to_num(probabilities), axis=1)]
     extras = ('target_id', 'existence', 'collision_probability', 'vertical_offset_lo')
-    extras = (*models, *extras, 'vertical_offset_hi')
-    return rows | {name: column(name) for name in extras if name in given}
+    more = (*models, *extras, 'vertical_offset_hi')
+    return rows | {name: column(name) for name in more if name in given}
 
 
 def _ellipses(
