@@ -229,13 +229,10 @@ def test_links_of_a_symlink_install_lead_to_the_source(tmp_path):
     assert share_folder(link / 'resources.py') == tmp_path / 'src'
 
 
-def test_a_copied_module_says_what_is_missing(tmp_path):
+def test_a_shared_file_is_found_and_what_is_missing_is_named(tmp_path):
     module = touch(tmp_path / 'sonar_imm' / 'resources.py')
     with pytest.raises(FileNotFoundError, match='install the package with pip or colcon'):
         share_folder(module)
-
-
-def test_a_shared_file_is_found_and_one_that_is_unknown_is_named():
     assert 'ros__parameters' in shared_file('config/diver.yaml').read_text(encoding='utf-8')
     with pytest.raises(FileNotFoundError, match="no shared file 'bags/nothing'"):
         shared_file('bags/nothing')

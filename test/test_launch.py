@@ -51,15 +51,11 @@ def test_each_node_has_a_launch_file_that_starts_its_executable(system):
     assert include.get('file') == f'{SHARE}launch/node.launch.xml'
     assert given == {'system': system}
     (node,) = tree('node').findall('node')
-    assert node.get('exec').replace('$(var system)', system) in executables()
+    installed = {f'{system}_node' for system in SYSTEMS}
+    installed.update(re.findall(r"'(\w+_node) = ", (ROOT / 'setup.py').read_text()))
+    assert node.get('exec').replace('$(var system)', system) in installed
     # The name is what the parameter files and the remaps of the documentation use.
     assert node.get('name') == '$(var system)'
-
-
-def executables():
-    """What setup.py installs for `ros2 run`."""
-    names = {f'{system}_node' for system in SYSTEMS}
-    return names | set(re.findall(r"'(\w+_node) = ", (ROOT / 'setup.py').read_text()))
 
 
 def test_the_file_for_all_starts_every_system_once_in_a_namespace_of_its_own():

@@ -85,7 +85,11 @@ def setup_lists():
 def test_there_is_one_version(manifest):
     assert sonar_imm.__version__ == msg_adapters.__version__ == manifest.findtext('version')
     changelog = (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8')
-    assert re.search(rf'^{re.escape(sonar_imm.__version__)} \(.+\)$', changelog, re.MULTILINE)
+    version = re.escape(sonar_imm.__version__)
+    dated = re.search(rf'^{version} \(([\d-]+)\)$', changelog, re.MULTILINE)
+    cited = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
+    assert cited['version'] == sonar_imm.__version__ and len(cited['references']) == 4
+    assert dated and cited.get('date-released', dated[1]) == dated[1]
 
 
 def test_every_key_of_package_xml_is_one_of_rosdep_or_a_package_of_jazzy(manifest):
@@ -108,34 +112,22 @@ def test_catkin_reads_the_package_and_its_changelog():
     assert version == read.version
 
 
-def test_package_xml_and_setup_name_the_same_run_time_dependencies(manifest, setup_lists):
+def test_package_xml_and_setup_name_the_same_dependencies_and_versions(manifest, setup_lists):
+    requires, tests = setup_lists['REQUIRES'], setup_lists['EXTRAS']['test']
     wanted = {PYPI_OF_KEY[key] for key in texts(manifest, 'exec_depend') if key != 'rclpy'}
-    assert wanted | WITHOUT_KEY == {distribution(line) for line in setup_lists['REQUIRES']}
-
-
-def test_package_xml_and_setup_pin_the_same_versions(manifest, setup_lists):
-    extras = setup_lists['EXTRAS']
-    assert isinstance(extras, dict)
-    pins = {
-        distribution(line): set(re.findall(r'[<>]=?[0-9.]+', line))
-        for line in (*setup_lists['REQUIRES'], *extras['test'])
-    }
-    signs = {'version_gte': '>=', 'version_lt': '<'}
-    for kind in ('exec_depend', 'test_depend'):
-        for element in manifest.findall(kind):
-            if (name := PYPI_OF_KEY.get(str(element.text))) is not None:
-                given = {signs[key] + value for key, value in element.attrib.items()}
-                assert given == pins[name], name
-
-
-def test_package_xml_and_setup_name_the_same_test_dependencies(manifest, setup_lists):
+    assert wanted | WITHOUT_KEY == {*map(distribution, requires)}
     # The linters of ament come with ROS 2, not from PyPI.
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
-    wanted = {PYPI_OF_KEY[key] for key in keys}
     without_key = 'laspy obspy pyais pyarrow pynmea2 pyogrio pyxtf segyio soundfile'.split()
-    assert wanted | {*without_key} == {
-        distribution(line) for line in setup_lists['EXTRAS']['test']
+    assert {PYPI_OF_KEY[key] for key in keys}.union(without_key) == {*map(distribution, tests)}
+    pins = {
+        distribution(line): set(re.findall(r'[<>]=?[0-9.]+', line)) for line in (*requires, *tests)
     }
+    signs = {'version_gte': '>=', 'version_lt': '<'}
+    for element in (*manifest.findall('exec_depend'), *manifest.findall('test_depend')):
+        if (name := PYPI_OF_KEY.get(str(element.text))) is not None:
+            given = {signs[key] + value for key, value in element.attrib.items()}
+            assert given == pins[name], name
 
 
 def test_every_import_is_declared(manifest, setup_lists):
@@ -147,13 +139,6 @@ def test_every_import_is_declared(manifest, setup_lists):
     for path in MODULES:
         used = {name.split('.')[0] for name in imports(path)}
         assert used - declared <= PEERS.get(module_name(path), set()), path
-
-
-def test_the_citation_names_this_version():
-    cited = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
-    assert cited['version'] == sonar_imm.__version__ and len(cited['references']) == 4
-    dated = re.search(r'^(\S+) \(([\d-]+)\)$', (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
-    assert dated and cited.get('date-released', dated[2]) == dated[2]
 
 
 def test_the_conda_recipe_has_the_version_and_the_requirements_of_setup(setup_lists):

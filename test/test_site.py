@@ -56,6 +56,9 @@ def test_every_page_is_in_the_navigation(made, monkeypatch):
     pages |= {f'reference/{name}.md' for name in ('interfaces', 'options', 'bags')}
     pages |= {f'examples/{path.stem}.md' for path in (ROOT / 'examples').glob('*.ipynb')}
     assert in_navigation(config['nav']) == pages
+    page = made.recordings()
+    for path in (ROOT / 'bags').glob('*/README.md'):
+        assert f'| [{path.parent.name}](#' in page and f'## {path.parent.name}\n' in page
     # Links to notebooks lead to their pages; a site alone asks for no list of versions.
     text = '[a](../../examples/own_data.ipynb), [b](../runs.md)'
     shown = made.on_page_markdown(text, None, None, None)
@@ -65,12 +68,6 @@ def test_every_page_is_in_the_navigation(made, monkeypatch):
     assert 'version' in made.on_config(given).extra
     monkeypatch.delenv('SITE_VERSIONS')
     assert 'version' not in made.on_config(given).extra
-
-
-def test_every_recording_is_on_their_page(made):
-    page = made.recordings()
-    for path in (ROOT / 'bags').glob('*/README.md'):
-        assert f'| [{path.parent.name}](#' in page and f'## {path.parent.name}\n' in page
 
 
 def test_the_api_has_every_public_module(made):
@@ -135,7 +132,11 @@ def test_links_between_files_lead_somewhere():
     assert broken == set()
 
 
-def test_what_comes_from_another_server_is_seen(made):
+def test_what_comes_from_another_server_is_seen_and_the_search_needs_none(made):
+    config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
+    (script,) = config['extra']['polyfills']
+    assert 'iframe-worker' in script, 'else the plugin loads one of this name from afar'
+    assert 'offline' in config['plugins'] and (ROOT / 'docs' / script).is_file()
     page = (
         '<link rel="canonical" href="https://a.org/"><link rel=stylesheet href=assets/a.css>'
         '<a href="https://b.org">b</a><script src="https://c.org/c.js"></script>'
@@ -154,13 +155,6 @@ def test_on_a_phone_each_cell_has_the_head_of_its_column(made):
     shown = made.on_page_content(page, None, None, None)
     assert '<td data-label="a">1</td>\n<td data-label="b c" style="x">2</td>' in shown
     assert shown.endswith('<td>')
-
-
-def test_the_search_needs_no_server():
-    config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
-    (script,) = config['extra']['polyfills']
-    assert 'iframe-worker' in script, 'else the plugin loads one of this name from afar'
-    assert 'offline' in config['plugins'] and (ROOT / 'docs' / script).is_file()
 
 
 # -- each row of SECURITY.md names a file of tests that exists --

@@ -15,6 +15,8 @@ import sys
 
 import pytest
 
+from sonar_imm.trackers import SYSTEMS
+
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = ('OPENBLAS', 'GOTO', 'OMP', 'MKL', 'BLIS')
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else 0
@@ -110,11 +112,9 @@ def test_a_node_has_one_thread_of_algebra(threads_of, loaded_alone, start):
 
 
 def test_every_node_has_its_command():
-    from sonar_imm.trackers import SYSTEMS
-
     text = (ROOT / 'setup.py').read_text(encoding='utf-8')
-    assert "f'{system}_node = sonar_imm.nodes.commands:main'" in text
-    assert "'fls_detector_node = sonar_imm.nodes.commands:main'" in text
+    for name in ("f'{system}", "'fls_detector"):
+        assert f"{name}_node = sonar_imm.nodes.commands:main'" in text
     for name in (*SYSTEMS, 'fls_detector'):
         module = (ROOT / 'sonar_imm' / 'nodes' / f'{name}.py').read_text(encoding='utf-8')
         assert '\ndef main(' in module

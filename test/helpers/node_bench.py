@@ -200,6 +200,9 @@ class Rig(Driven):
     def send(self, *messages):
         self.publish(self.fix, *messages)
 
+    def end(self):
+        self.bench.end(self.node)
+
     def means(self):
         return [(e.stamp_ns / SECOND, *e.state[0, :2]) for e in map(read_estimate, self.estimates)]
 

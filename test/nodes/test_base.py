@@ -8,16 +8,14 @@
 
 """The node around a tracker, with real publishers and subscriptions in one process."""
 
-import itertools
 import time
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
 from helpers.node_bench import a_fix, FIX, Rig, values_of
 import pytest
-from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
@@ -240,23 +238,6 @@ def test_an_incompatible_publisher_is_named_and_told_the_name_of_a_remapped_topi
     received.clear()  # one report may have been on its way
     bench.spin_until(lambda: received and 'incompatible peer on fix' in values_of(received[-1]))
     assert values_of(received[-1])['incompatible peer on fix'] == 'RELIABILITY'
-
-
-def test_accepted_changes_are_said_on_rosout(make_bench):
-    # A name of its own: a node of an earlier test that is only now collected takes the publisher
-    # of its name along. A late subscriber gets what was logged before: it may be known here and
-    # not yet matched.
-    rig = Rig(make_bench('-r', '__ns:=/talker'), topic='/talker/fix', name='/talker/walker')
-    lasting = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    received = rig.bench.listen(Log, '/rosout', lasting)
-    times = itertools.cycle((3.5, 4.5))
-
-    def said():
-        # again and again: the first words may be lost before the two have met
-        rig.node.set_parameters([Parameter('stale_after', value=next(times))])
-        return any('stale_after is ' in item.msg for item in received)
-
-    rig.bench.spin_until(said)
 
 
 def test_a_clock_that_goes_back_resets_and_its_first_tick_does_not(make_bench):

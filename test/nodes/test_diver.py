@@ -21,12 +21,7 @@ from sensor_msgs.msg import JointState, NavSatFix, PointCloud2
 from std_srvs.srv import Trigger
 
 from msg_adapters.estimates import read_estimate
-from msg_adapters.fixes import (
-    read_geodetic,
-    write_fix,
-    write_geodetic,
-    write_start,
-)
+from msg_adapters.fixes import read_geodetic, write_fix, write_geodetic, write_start
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix, GeodeticFix, Start
@@ -128,18 +123,6 @@ def test_what_waited_in_the_node_is_dropped_and_what_is_late_is_not(rig, waited,
     assert ('12 messages dropped' in said) == (not used)
     assert ('arrive that late' in said) == (behind == 20)
     assert ('the clock of this computer' in said) == (abs(behind) == 3600)
-
-
-def test_a_diver_is_tracked_from_fixes(rig):
-    bench, node, odometry, probabilities = rig
-    publisher = bench.publisher(POSE, '/fix', 10)
-    for second in range(1, 31):
-        bench.send(node, publisher, a_fix(second * SECOND, 1.0 * second, 0.0, 0.01 * np.eye(2)))
-    bench.spin_until(lambda: odometry and odometry[-1].header.stamp.sec == 30)
-    assert odometry[-1].pose.pose.position.x == pytest.approx(30.0, abs=0.5)
-    assert odometry[-1].twist.twist.linear.x == pytest.approx(1.0, abs=0.2)
-    best = int(np.argmax(probabilities[-1].position))
-    assert probabilities[-1].name[best] == 'quiet'  # a straight line
 
 
 # -- positions as users have them: on Earth, with names --

@@ -27,6 +27,7 @@ from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.managed import Warming
 from sonar_imm.nodes.messages import message_class
 from sonar_imm.nodes.qos import output_qos
+from sonar_imm.parameters import ConfigError
 
 pytestmark = pytest.mark.usefixtures('walker')
 CONFIGURED = Transition.TRANSITION_ON_CONFIGURE_SUCCESS
@@ -157,15 +158,23 @@ def test_what_fails_while_configuring_is_logged_and_can_be_tried_again(manage, t
     assert manager.ask('configure') and manager.state() == 'inactive'
 
 
-def test_kernels_that_cannot_be_compiled_leave_the_node_unconfigured(manage, monkeypatch, capfd):
+def test_kernels_that_cannot_be_loaded_leave_a_node_unconfigured_or_end_it(
+    manage, make_bench, monkeypatch, capfd
+):
+    errors = [ConfigError('compiled kernels cannot be read'), ZeroDivisionError('a bug')]
+
     def fails(self, inputs):
-        raise ZeroDivisionError('a bug')
+        raise errors.pop()
 
     monkeypatch.setattr(WalkerTracker, 'warm', fails)
     manager = manage()
     assert not manager.ask('configure') and manager.state() == 'unconfigured'
     assert 'ZeroDivisionError: a bug' in capfd.readouterr().err
     assert not manager.node.count_publishers('/walker/estimate')
+    bench = make_bench()
+    bench.start(TrackerNode, 'walker')
+    with pytest.raises(ConfigError, match='cannot be read'):
+        bench.spin_until(lambda: False)
 
 
 def test_an_input_that_cannot_be_heard_leaves_the_node_inactive(manage, capfd):

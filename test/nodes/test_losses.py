@@ -68,19 +68,6 @@ def test_the_losses_of_publishers_add_up(seed):
     assert line.gaps.lost == lost
 
 
-def test_a_second_publisher_is_no_gap():
-    line = Line()
-    for _ in range(100):
-        line.send('old')
-    line.publishers = 2
-    line.numbers['new'] = 5000
-    line.send('new')
-    for name in ('old', 'new', 'new', 'old') * 10:
-        line.send(name)
-    assert line.gaps.lost == 0
-    assert line.send('old', skip=4) == 4
-
-
 def test_a_publisher_that_left_is_not_continued_by_another():
     line = Line(publishers=2)
     line.numbers['other'] = 60

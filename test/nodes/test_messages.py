@@ -93,18 +93,15 @@ CASES = [
 
 
 @pytest.mark.parametrize('repeat', [1, 2])
-def test_what_arrives_is_what_was_published_whatever_came_before(repeat):
+def test_what_arrives_is_what_was_published_whatever_came_before(repeat, monkeypatch):
     paper = Paper()
     publisher = TablePublisher(paper)
     for case in CASES:
         for _ in range(repeat):
             publisher.publish(table(**case))
             assert isinstance(paper.sent[-1], bytes) and paper.message == table(**case)
-
-
-def test_a_table_whose_bytes_are_not_understood_is_published_as_any_other_message(monkeypatch):
+    # A table whose bytes are not understood is published as any other message.
     monkeypatch.setattr('sonar_imm.nodes.outputs._STAMP', 8)
-    paper = Paper()
     publisher = TablePublisher(paper)
     for case in CASES:
         publisher.publish(table(**case))
@@ -125,10 +122,7 @@ def test_every_answer_has_its_counts_and_its_stamp():
         assert message.data == array.array('B', np.array([*counts.values()], '<f8').tobytes())
         assert [field.name for field in message.fields] == ['a', 'b']
         assert message.header.stamp == (type(stamp)() if when is None else when)
-
-
-def test_counts_beyond_32_bits_do_not_wrap():
-    paper = Paper()
+    # Counts beyond 32 bits do not wrap.
     answers = ProcessedPublisher(paper)
     for messages in (1, 2**32 + 7, 2**53 - 1):
         answers.publish({'messages': messages, 'refused': 0, 'estimates': messages - 1})

@@ -21,7 +21,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty
 
 from sonar_imm.nodes.qos import Endpoints, lockstep_qos, output_qos
-from sonar_imm.nodes.running import EVENT_PERIOD, MessagesFirst
+from sonar_imm.nodes.running import EVENT_PERIOD, help_text, MessagesFirst
+from sonar_imm.parameters import ConfigError
 from sonar_imm_tools.replay.harness import reserved_domain_id
 from sonar_imm_tools.replay.link import Link
 
@@ -64,6 +65,14 @@ def test_events_are_asked_a_few_times_a_second_only(make_bench, monkeypatch):
 
 
 # -- How the process of a node ends --
+
+
+@pytest.mark.parametrize(
+    'words, said', [(['-p', 'a:=1.0'], "'-p' has to follow --ros-args"), (['on'], 'see --help')]
+)
+def test_words_that_are_no_ros_arguments_are_told(words, said):
+    with pytest.raises(ConfigError, match=said):
+        help_text(['diver', *words])
 
 
 PROGRAM = """

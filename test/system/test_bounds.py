@@ -29,8 +29,6 @@ LIMITS = {
 
 @pytest.mark.parametrize('name', CASES)
 def test_the_hardest_message_of_each_kind_is_bounded(name):
-    given = measured(name)
-    seconds, megabytes = LIMITS[name]
-    assert not given['refused']
-    assert 0.0 < given['cpu_s'] < seconds
+    given, (seconds, megabytes) = measured(name), LIMITS[name]
+    assert not given['refused'] and 0.0 < given['cpu_s'] < seconds
     assert given['memory_mb'] < megabytes

@@ -7,12 +7,15 @@
 # language governing permissions and limitations under the License.
 
 """Real nodes beside the command, which starts and ends them itself, as processes: that is what is
-tried, where two are in a row or messages come late. That live in lock-step and offline are the
-same is said of each node by `nodes/test_every_node.py`, in one process.
+tried, where two are in a row or messages come late; and `echo`, which finds publishers of other
+processes. That live in lock-step and offline are the same is said of each node by
+`nodes/test_every_node.py`, in one process.
 """
 
 import json
+import os
 from pathlib import Path
+import re
 import shutil
 import signal
 import subprocess
@@ -21,39 +24,15 @@ import time
 
 from helpers.commands import children
 from helpers.dive_bags import write_dive
+from helpers.faults.rig import wait_until_ready
 from helpers.source import ROOT
 import pytest
 
-pytest.importorskip('rclpy')
-
-from sonar_imm_tools.cli import main  # noqa: E402
-from sonar_imm_tools.cli.checking import play_recording  # noqa: E402
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.cli.checking import play_recording
+from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id
 
 pytestmark = pytest.mark.system
-
-SCENES = {
-    'diver': ('diver', 'irregular', '3', 'duration=40'),
-    'images': (
-        *('obstacle', 'images', '2', 'last_range=33', 'image_beams=64', 'image_bins=200'),
-        *('target=point', 'horizontal_fov_deg=30', 'late_fraction=0.2'),
-    ),
-}
-
-
-@pytest.fixture(scope='module')
-def bags(tmp_path_factory):
-    """What gives the bag of one of the `SCENES`."""
-    folder = tmp_path_factory.mktemp('bags')
-
-    def bag(name):
-        path, (system, scenario, seed, *settings) = folder / name, SCENES[name]
-        given = [word for setting in settings for word in ('--set', setting)]
-        if not path.exists():
-            words = ['simulate', system, str(path), '--seed', seed, '--scenario', scenario]
-            assert main([*words, *given]) == 0
-        return path
-
-    return bag
 
 
 def checked(capsys, system, bag, out, *more):
@@ -74,9 +53,12 @@ def run_of(folder):
     return json.loads((folder / 'run.json').read_text())
 
 
-def test_images_go_through_two_nodes_live_as_offline(bags, tmp_path, capsys):
-    offline = checked(capsys, 'obstacle', bags('images'), tmp_path, '--limit', '8')
-    run = run_of(offline)
+def test_images_go_through_two_nodes_live_as_offline(tmp_path, capsys):
+    small = 'last_range=33 image_beams=64 image_bins=200 target=point horizontal_fov_deg=30'
+    settings = [f'--set={each}' for each in (*small.split(), 'late_fraction=0.2')]
+    words = 'simulate', 'obstacle', str(tmp_path / 'bag'), '--seed', '2', '--scenario', 'images'
+    assert main([*words, *settings]) == 0
+    run = run_of(checked(capsys, 'obstacle', tmp_path / 'bag', tmp_path / 'out', '--limit', '8'))
     assert run['topics']['/image'] == 'image' and run['detector']['image_far_range'] == 55.0
 
 
@@ -111,8 +93,9 @@ def test_check_replaces_no_file_of_the_user(tmp_path):
 
 
 @pytest.mark.parametrize('how', [signal.SIGTERM, signal.SIGHUP])
-def test_a_check_that_is_ended_takes_its_node_along(bags, how):
-    words = ['-m', 'sonar_imm_tools.cli', 'check', 'diver', '--bag', str(bags('diver'))]
+def test_a_check_that_is_ended_takes_its_node_along(how):
+    bag = str(ROOT / 'bags' / 'diver_table1')
+    words = ['-m', 'sonar_imm_tools.cli', 'check', 'diver', '--bag', bag]
     check = subprocess.Popen(
         [sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -124,3 +107,44 @@ def test_a_check_that_is_ended_takes_its_node_along(bags, how):
     _, printed = check.communicate(timeout=300.0)
     assert check.returncode == 128 + how and 'Traceback' not in printed
     assert not any(Path(f'/proc/{node}').exists() for node in nodes)
+
+
+def command(domain, *arguments):
+    """A started command in the ROS domain `domain`."""
+    return subprocess.Popen(
+        [sys.executable, '-m', 'sonar_imm_tools.cli', *map(str, arguments)], cwd=ROOT,
+        env=dict(os.environ, ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST'),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def playing(tmp_path, monkeypatch):
+    """The domain of a diver node that gets fixes again and again."""
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    bag = write_dive(tmp_path / 'dive')
+    with reserved_domain_id() as domain, NodeProcess('diver', domain_id=domain) as node:
+        wait_until_ready([node])
+        player = command(domain, 'play', bag, '--rate', '20', '--loop')
+        try:
+            yield domain
+        finally:
+            player.terminate()
+            player.communicate()
+        assert node.process.poll() is None
+
+
+def test_estimates_are_found_and_shown(playing):
+    echoes = [
+        command(playing, 'echo', '--timeout', '300', *words.split())
+        for words in ('--once', 'diver/estimate --json --count 3', '/truth/estimate --once')
+    ]
+    (text, error), (tables, _), (truth, _) = (echo.communicate(timeout=600) for echo in echoes)
+    assert [echo.returncode for echo in echoes] == [0, 0, 0]
+    lines, tables = text.splitlines(), [json.loads(line) for line in tables.splitlines()]
+    assert 'listening to /diver/estimate' in error and lines[0].startswith('/diver/estimate  20')
+    assert 'frame map  1 row' in lines[0] and lines[1].split()[2:4] == ['px', 'py']
+    assert '±' in lines[2] and re.search(r'(heading_\d{3}|hover|lively_\w+|quiet) +\d+%', lines[2])
+    assert [table['topic'] for table in tables] == ['/diver/estimate'] * 3
+    assert len({table['stamp_ns'] for table in tables}) == 3 and tables[0]['types']['px'] == 'f8'
+    assert truth.startswith('/truth/estimate')

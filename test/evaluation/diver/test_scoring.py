@@ -105,8 +105,7 @@ def test_several_targets_are_scored_by_gospa():
     gospa = scored(estimates, truth, cutoff=10.0)['gospa']
     # one target 5 m off, one missed at 10^2 / 2; then two hits
     assert gospa['mean_m'] == pytest.approx(np.sqrt(25.0 + 50.0) / 2.0)
-    assert gospa['missed_per_scan'] == pytest.approx(0.5)
-    assert gospa['false_per_scan'] == 0.0
+    assert gospa['missed_per_scan'] == pytest.approx(0.5) and gospa['false_per_scan'] == 0.0
 
 
 def two_divers(errors, stated_std, fix_std, seed=4):
@@ -347,8 +346,7 @@ def test_errors_are_estimate_minus_truth_and_what_is_left_over_is_kept_apart():
     order = np.argsort(matching.target)
     np.testing.assert_allclose(matching.error[order, :2], [[0.5, 0.0], [1.0, -2.0]])
     matching = scene([[(1.0, 0.0), (60.0, 0.0)], [(30.0, 0.0)]], [[1, 2], [2]])
-    assert matching.distance.tolist() == [1.0, 0.0]
-    assert matching.beyond_row.tolist() == [1]
+    assert matching.distance.tolist() == [1.0, 0.0] and matching.beyond_row.tolist() == [1]
     assert matching.beyond_truth[:, 0].tolist() == [30.0]
     # One target with one track is matched however far.
     alone = scene([[(1000.0, 0.0)]], [[7]], targets=[(0.0, 0.0)])
@@ -365,13 +363,6 @@ def test_a_switch_is_counted_once_a_gap_is_none_and_a_track_on_nothing_is_false(
     assert summary['false_rows_per_scan'] == 1.0 and summary['true_targets'] == 2
     matching = scene([[]], [[]])
     assert len(matching.row) == 0 and track_summary(matching)['completeness'] == 0.0
-
-
-def test_scans_without_truth_are_not_scored():
-    estimates = [estimate_at(START_NS + k * SECOND, [[0.0] * 4], [1]) for k in range(5)]
-    truths = [truth_estimate(START_NS + k * SECOND, [[0.0] * 4], [1]) for k in (1, 2)]
-    matching = match(series_of(estimates), Truth.from_series(series_of(truths)), cutoff=10.0)
-    assert len(matching.scan_ns) == 2 and matching.scored.sum() == 2
 
 
 # -- estimates as flat arrays ---------------------------------------------------------------------
@@ -394,12 +385,16 @@ def test_rows_come_out_by_stamp_with_their_columns():
     assert np.isnan(truth.covariance).all()
 
 
-def test_scans_without_rows_are_remembered_and_nothing_makes_an_empty_series():
+def test_scans_without_rows_are_remembered_and_without_truth_not_scored():
     nothing = estimate_at(START_NS, np.empty((0, 4)), [])
     series = series_of([nothing, estimate_at(START_NS + 1, STATES[:1], [4])])
     assert series.scan_ns.tolist() == [START_NS, START_NS + 1] and len(series) == 1
     series = series_of([])
     assert len(series) == len(series.scan_ns) == 0 and series.longest_track() is None
+    estimates = [estimate_at(START_NS + k * SECOND, [[0.0] * 4], [1]) for k in range(5)]
+    truths = [truth_estimate(START_NS + k * SECOND, [[0.0] * 4], [1]) for k in (1, 2)]
+    matching = match(series_of(estimates), Truth.from_series(series_of(truths)), cutoff=10.0)
+    assert len(matching.scan_ns) == 2 and matching.scored.sum() == 2
 
 
 def test_a_table_of_something_else_and_two_runs_in_one_are_refused():

@@ -51,9 +51,9 @@ _REPORTS = 12
 @frozen
 class Outcome:
     """What a fault did. recovered: messages on the primary input until all later estimates agree
-    with the undisturbed run, None for never; losses: counted in /diagnostics, by reason; levels
-    and words: of /diagnostics while it lasted, and of the log, where some are said once;
-    estimates: in the rest, of how many; answered: whether the node goes on answering messages."""
+    with the undisturbed run, None for never; estimates: in the rest, of how many; losses: counted
+    in /diagnostics, by reason; levels, words: of /diagnostics meanwhile, and of the log; answered:
+    whether the node goes on answering messages."""
 
     recovered: int | None
     estimates: tuple[int, int]
@@ -179,7 +179,6 @@ class Rig:
     def send_at_once(self, messages):
         """Send messages without waiting, and then wait for all answers."""
         sent = time.monotonic()
-        messages = list(messages)
         for message in messages:
             self.publishers[message.topic].publish(message.content)
         self.lockstep.follow(len(messages), 'all', sent)
@@ -195,10 +194,10 @@ class Rig:
         return self.link.node.create_publisher(self._classes[topic], f'/{topic}', qos)
 
     def reset(self):
-        assert self.call(Trigger, 'reset', Trigger.Request()).success
+        assert self.call(Trigger, 'reset').success
 
     def enable(self, on):
-        assert self.call(SetBool, 'enable', SetBool.Request(data=on)).success
+        assert self.call(SetBool, 'enable', data=on).success
 
     def tell_clock(self, stamp_ns):
         """Publish on /clock."""
@@ -207,27 +206,26 @@ class Rig:
 
     def wait_for_clock(self, stamp_ns, *, back):
         """Publish on /clock until the node lives at that time; back: until it said so."""
-        logged = self.node.log().count('/clock is back')
+        logged = self.node.log().count('/clock is back') + back
 
         def there():
             self.tell_clock(stamp_ns)
-            return not back or self.node.log().count('/clock is back') > logged
+            return self.node.log().count('/clock is back') >= logged
 
         assert self.wait_for(there)
 
     def set_parameters(self, **values):
         """Set parameters from outside: whether each was taken."""
         given = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-        request = SetParameters.Request(parameters=given)
-        results = self.call(SetParameters, 'set_parameters', request).results
+        results = self.call(SetParameters, 'set_parameters', parameters=given).results
         return [each.successful for each in results]
 
-    def call(self, service, name, request):
+    def call(self, service, name, **request):
         """Call a service of the node."""
         client = self.link.node.create_client(service, f'/{self.case.system}/{name}')
         try:
             assert self.wait_for(client.service_is_ready)
-            future = client.call_async(request)
+            future = client.call_async(service.Request(**request))
             assert self.wait_for(future.done)
             return future.result()
         finally:
@@ -246,10 +244,8 @@ class Rig:
 
     def play(self, steps, reports=0):
         """Send messages and do actions; gives the estimates that were published meanwhile.
-
         reports: how many of /diagnostics are waited for on the way: a level rises when a finding
-        is there in two periods, and lock-step may be done in less.
-        """
+        is there in two periods, and lock-step may be done in less."""
         start = len(self.recorder)
         every = len(steps) // reports + 1 if reports else len(steps) + 1
         for number, step in enumerate(steps, start=1):

@@ -60,9 +60,7 @@ def twice(during):
 @middle
 def late(during, places=3):
     """Every fourth message on the primary input comes `places` of them later."""
-    held = []
-    sent = []
-    count = 0
+    held, sent, count = [], [], 0
     for step in during:
         count += step.primary
         if step.primary and count % 4 == 0:
@@ -196,10 +194,8 @@ def simulated_clock(seconds):
     def disturb(before, during, after):
         rest = [step.moved(seconds) for step in [*during, *after]]
         first = Action(lambda rig: rig.wait_for_clock(rest[0].stamp_ns, back=seconds < 0.0))
-        return (
-            [step for item in before for step in split(item)],
-            [first, *(step for item in rest for step in split(item))],
-        )
+        start, end = ([step for item in part for step in split(item)] for part in (before, rest))
+        return start, [first, *end]
 
     return disturb
 
@@ -263,45 +259,30 @@ FAULTS = (
     Fault('a burst', burst(), settle=0),
     Fault('sensor clock two hours ahead', clock_set(2.0 * HOUR)),
     Fault('sensor clock two hours back', clock_set(-2.0 * HOUR)),
-    Fault(
-        '/clock and stamps an hour back', simulated_clock(-HOUR), says='/clock is back',
-        arguments=SIMULATED,
-    ),
+    Fault('/clock and stamps an hour back', simulated_clock(-HOUR), (), 'OK', '/clock is back',
+          arguments=SIMULATED),
     Fault('/clock and stamps an hour ahead', simulated_clock(HOUR), arguments=SIMULATED),
     Fault('looped recording', looped),
     Fault('no navigation for a while', dropped('nav'), systems=['obstacle']),
-    Fault(
-        'another frame for a while', each(frame('elsewhere')), ['refused: frame', 'other_frame'],
-        level='WARN', says='frame',
-    ),
+    Fault('another frame for a while', each(frame('elsewhere')),
+          ['refused: frame', 'other_frame'], 'WARN', 'frame'),
     *(
-        Fault(
-            'a second publisher, its clock late', second_publisher(CASES[system].window + 3.0),
-            ['too_late'], level='WARN', says='not used: too_late', settle=0, systems=[system],
-        )
+        Fault('a second publisher, its clock late', second_publisher(CASES[system].window + 3.0),
+              ['too_late'], 'WARN', 'not used: too_late', 0, [system])
         for system in ('diver', 'obstacle')
     ),
     # Four messages, which are too few for a warning.
-    Fault(
-        'a second publisher, its clock late', second_publisher(3.0), ['too_late'], settle=0,
-        systems=['fathometer'],
-    ),
+    Fault('a second publisher, its clock late', second_publisher(3.0), ['too_late'], settle=0,
+          systems=['fathometer']),
     in_another_unit('bearings in degrees', ['obstacle'], bearing=57.29578),
     in_another_unit('ranges in millimetres', ['obstacle', 'bathymetry'], range=1000.0),
     in_another_unit('sound speed in feet per second', ['bathymetry'], sound_speed=3.28084),
-    Fault(
-        'depths in feet', each(columns(depth=3.28084)), ['other_depths'], level='WARN',
-        says='not used: other_depths', systems=['fathometer'],
-    ),
+    Fault('depths in feet', each(columns(depth=3.28084)), ['other_depths'], 'WARN',
+          'not used: other_depths', systems=['fathometer']),
     in_another_unit('depths in millimetres', ['fathometer'], depth=1000.0),
-    Fault(
-        'a publisher that cannot be heard (QoS)', unheard_publisher(BEST_EFFORT), level='WARN',
-        says='quality of service', settle=0,
-    ),
+    Fault('a publisher that cannot be heard (QoS)', unheard_publisher(BEST_EFFORT), (), 'WARN',
+          'quality of service', 0),
     Fault('storm of parameters', parameter_storm(), says='parameters changed', settle=0),
-    Fault(
-        'the state cannot be saved (read-only disk)', long_enough(), level='WARN',
-        says='the state cannot be saved', settle=0,
-        arguments=('-p', 'state_file:=/sys/sonar_imm_state'),
-    ),
+    Fault('the state cannot be saved (read-only disk)', long_enough(), (), 'WARN',
+          'the state cannot be saved', 0, arguments=('-p', 'state_file:=/sys/sonar_imm_state')),
 )  # fmt: skip

@@ -14,7 +14,7 @@ import numpy as np
 
 from msg_adapters.estimates import write_estimate
 
-from .schema import make
+from .streams import make
 
 ROUNDING = 1e-9
 
