@@ -32,7 +32,7 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm_tools.evaluation import numbers, plotting, report
+from sonar_imm_tools.evaluation import judging, numbers, plotting, report
 from sonar_imm_tools.evaluation.diver import figures, METRICS, seen, summary_sentence
 from sonar_imm_tools.evaluation.diver.scoring import score
 from sonar_imm_tools.evaluation.diver.series import series_of, Truth
@@ -442,8 +442,7 @@ def test_truth_of_another_bag_is_scored(tmp_path):
 def test_truth_and_estimates_of_something_else_are_one_sentence(system, tmp_path, monkeypatch):
     place = {name: np.zeros(1, np.float32) for name in 'xyz'}
     nothing = [Estimate.from_columns(place, stamp_ns=1, frame_id='map')]
-    module = import_module(f'sonar_imm_tools.evaluation.{system}')
-    monkeypatch.setattr(module, 'read_truth', lambda *_: nothing)
+    monkeypatch.setattr(judging, 'read_truth', lambda *_: nothing)
     with pytest.raises(BagError, match=re.escape(f'{tmp_path / "dive"}: ')):
         judge(folder_of(tmp_path, system=system))
     with pytest.raises(BagError, match="no column 'px'|not those of obstacles"):

@@ -50,7 +50,7 @@ class Tracked:
             found = [item.measurement for item in read]
         good = [m for m in found if m is not None and not isinstance(m, Rejection)]
         self.input, tracker = good[: MOST[self.system.name]], self.build()
-        self.whole = [published(tracker, m) for m in self.input]
+        self.whole = published(tracker, self.input)
         self.counts = tracker.counts
 
     def build(self):
@@ -86,14 +86,14 @@ def resumed(path, tracker, name):
     return tracker_from(read_state(path), SYSTEMS[name], tracker.config)
 
 
-def published(tracker, measurement):
-    """What a tracker publishes of a measurement, as bytes."""
-    return [as_bytes(estimate) for estimate in tracker.process(measurement)]
+def published(tracker, measurements):
+    """What a tracker publishes of each measurement, as bytes."""
+    return [as_bytes(tracker.process(measurement)) for measurement in measurements]
 
 
-def as_bytes(estimate):
-    message = write_estimate(estimate, ros_message)
-    return message.header.stamp.sec, message.header.stamp.nanosec, bytes(message.data)
+def as_bytes(estimates):
+    messages = [write_estimate(estimate, ros_message) for estimate in estimates]
+    return [(m.header.stamp.sec, m.header.stamp.nanosec, bytes(m.data)) for m in messages]
 
 
 tracked = functools.cache(Tracked)

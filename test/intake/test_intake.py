@@ -9,6 +9,7 @@
 """What /tf_static says: the place of a sonar on its vehicle, and measurements in another frame."""
 
 from collections import deque
+import contextlib
 
 import attrs
 from attrs import evolve
@@ -102,6 +103,28 @@ def test_a_change_of_parameters_keeps_the_mounting():
     assert tracker.config.detection_probability == 0.5 and tracker.config.sonar_lever == LEVER
 
 
+def test_a_required_frame_survives_a_reset_and_a_first_one_does_not():
+    tracker = built('diver')
+    for required in ('', 'map'):
+        intake = Intake(tracker, required)
+        tracker.process(intake.admit(fix('map', 1.0)))
+        refused = pytest.raises(Rejection, match="'odom' is not the frame 'map' of the tracks")
+        with refused:
+            intake.admit(fix('odom', 2.0))
+        intake.reset()
+        with refused if required else contextlib.nullcontext():
+            assert intake.admit(fix('odom', 2.0)).frame_id == 'odom'
+    # An array keeps to its first frame too.
+    scene, received = scene_of('bathymetry')
+    pings = (item.measurement for item in received)
+    snapshot = next(ping for ping in pings if isinstance(ping, measurements.Snapshot))
+    intake = Intake(built('bathymetry', **scene.instruments()))
+    first = evolve(snapshot, frame_id='array')
+    assert intake.admit(first) is first
+    with pytest.raises(Rejection, match="'hull' is not the frame 'array'"):
+        intake.admit(evolve(snapshot, frame_id='hull'))
+
+
 def fix(frame_id, x=0.0):
     return Fix(stamp_ns=10**9, position=[x, 0.0, 0.0], covariance=np.eye(2), frame_id=frame_id)
 
@@ -124,65 +147,34 @@ def test_a_position_in_another_frame_is_turned_where_the_transform_is_known():
         intake.admit(fix('odom', 1.0))
 
 
+def altitude(intake, frame_id, second=1):
+    """The altitude of that frame, admitted and processed."""
+    made = intake.admit(Altitude(stamp_ns=second * STAMP, altitude=9.0, frame_id=frame_id))
+    intake.tracker.process(made)
+    return made
+
+
 def test_an_altimeter_in_another_frame_is_turned_where_the_transform_is_known():
     intake = Intake(built('bathymetry'))
-
-    def take(frame_id):
-        made = intake.admit(Altitude(stamp_ns=10**9, altitude=9.0, frame_id=frame_id))
-        intake.tracker.process(made)
-        return made
-
-    assert take('dvl').altitude == 9.0
+    assert altitude(intake, 'dvl').altitude == 9.0
     with pytest.raises(Rejection, match="'altimeter' is not .* and no fixed transform joins"):
-        take('altimeter')
+        altitude(intake, 'altimeter')
     intake.admit(transforms(altimeter=('dvl', shift(0.0, 0.0, 1.5))))
-    made = take('altimeter')
+    made = altitude(intake, 'altimeter')
     assert made.altitude == 7.5 and made.frame_id == 'dvl'
 
 
 def test_a_late_altitude_does_not_shut_out_the_later_ones():
     intake = Intake(built('obstacle'))
     counts = intake.tracker.counts
-
-    def take(second, frame_id):
-        altitude = Altitude(stamp_ns=second * 10**9, altitude=9.0, frame_id=frame_id)
-        intake.tracker.process(intake.admit(altitude))
-
     for second in range(5000, 5005):
-        intake.tracker.process(intake.admit(level('map', second * 10**9)))
-    take(4000, 'another')
+        intake.tracker.process(intake.admit(level('map', second * STAMP)))
+    altitude(intake, 'another', 4000)
     assert counts['too_late'] == 1
-    take(5005, 'altimeter')
+    altitude(intake, 'altimeter', 5005)
     assert counts['used'] == 6
     with pytest.raises(Rejection, match="'another' is not the frame 'altimeter'"):
-        take(5006, 'another')
-
-
-def test_a_required_frame_survives_a_reset_and_a_first_one_does_not():
-    tracker = built('diver')
-    for required in ('', 'map'):
-        intake = Intake(tracker, required)
-        tracker.process(intake.admit(fix('map', 1.0)))
-        refused = pytest.raises(Rejection, match="'odom' is not the frame 'map' of the tracks")
-        with refused:
-            intake.admit(fix('odom', 2.0))
-        intake.reset()
-        if required:
-            with refused:
-                intake.admit(fix('odom', 2.0))
-        else:
-            assert intake.admit(fix('odom', 2.0)).frame_id == 'odom'
-
-
-def test_an_array_keeps_to_its_first_frame():
-    scene, received = scene_of('bathymetry')
-    pings = (item.measurement for item in received)
-    snapshot = next(ping for ping in pings if isinstance(ping, measurements.Snapshot))
-    intake = Intake(built('bathymetry', **scene.instruments()))
-    first = evolve(snapshot, frame_id='array')
-    assert intake.admit(first) is first
-    with pytest.raises(Rejection, match="'hull' is not the frame 'array'"):
-        intake.admit(evolve(snapshot, frame_id='hull'))
+        altitude(intake, 'another', 5006)
 
 
 def wandering(k, rng):
@@ -207,10 +199,8 @@ def entries(value):
     if attrs.has(type(value)):
         value = attrs.asdict(value, recurse=False)
     if isinstance(value, dict):
-        value = value.values()
-    elif not isinstance(value, (list, tuple, deque)):
-        return 1
-    return sum(map(entries, value))
+        value = list(value.values())
+    return sum(map(entries, value)) if isinstance(value, (list, tuple, deque)) else 1
 
 
 def test_a_tracker_does_not_grow_with_names_that_wander():
@@ -218,8 +208,7 @@ def test_a_tracker_does_not_grow_with_names_that_wander():
     intake = Intake(DiverTracker(DiverConfig(model_set='heading_speed', **parameters)))
     rng, sizes = np.random.default_rng(1), []
     for k in range(1, 61):
-        for item in wandering(k, rng):
-            admitted = intake.admit(item)
+        for admitted in map(intake.admit, wandering(k, rng)):
             if admitted is not None:
                 intake.tracker.process(admitted)
         sizes.append(entries(frozen_state(intake.tracker)))
@@ -301,19 +290,17 @@ def test_arrivals_are_turned_with_their_bearings():
     more = {'tx': np.ones((2, 3)), 'bearing': seen, 'var_bearing': 0.01}
     ping = arrivals(STAMP, rx, np.full(2, 0.05), **more)
     made = moved(ping, 'map', TURNED)
-    for k in range(2):
-        check_turned(ping.rx[k], made.rx[k], np.eye(2), np.eye(2))
-    assert made.bearing[0] == pytest.approx(3.0 + YAW - 2.0 * np.pi) and np.isnan(made.bearing[1])
+    for before, after in zip(ping.rx, made.rx):
+        check_turned(before, after, np.eye(2), np.eye(2))
+    assert made.bearing == pytest.approx([3.0 + YAW - 2.0 * np.pi, np.nan], nan_ok=True)
 
 
 def test_navigation_is_turned_as_its_pose_is():
     rng = np.random.default_rng(1)
-    root = rng.normal(size=(6, 6))
-    quaternion = rng.normal(size=4)
-    navigation = Navigation(
-        stamp_ns=STAMP, position=[1.0, 2.0, 3.0], velocity=[1.0, 0.5, 0.1], frame_id='odom',
-        orientation=quaternion / np.linalg.norm(quaternion), pose_covariance=root @ root.T,
-    )  # fmt: skip
+    root, quaternion = rng.normal(size=(6, 6)), rng.normal(size=4)
+    turn = {'orientation': quaternion / np.linalg.norm(quaternion), 'velocity': [1.0, 0.5, 0.1]}
+    place = {'position': [1.0, 2.0, 3.0], 'pose_covariance': root @ root.T, 'frame_id': 'odom'}
+    navigation = Navigation(stamp_ns=STAMP, **place, **turn)
     made = moved(navigation, 'map', TURNED)
     before = geometry.rotation_of_quaternion(navigation.orientation)
     after = geometry.rotation_of_quaternion(made.orientation)
@@ -374,28 +361,22 @@ def test_frames_whose_names_wander_are_forgotten_and_those_said_again_are_not():
 # One frame for one tracker.
 
 
-def test_the_first_named_frame_stays():
-    frames = KnownFrames()
-    for frame_id in ('', 'map', 'map'):
-        frames.admit(fix(frame_id))
-    with pytest.raises(Rejection) as caught:
-        frames.admit(fix('odom'))
-    assert caught.value.reason == 'frame'
-    assert caught.value.sentence == "the frame 'odom' is not the frame 'map' of the tracks"
-    assert reason(frames.admit, fix('')) == 'frame'
-    # A depth is one in any frame.
-    frames.admit(measurements.ArrayDepth(stamp_ns=1, depth=30.0, frame_id='buoy'))
-    assert frames.frame_id == 'map'
-
-
-def test_a_required_frame_holds_before_any_is_known():
-    frames = KnownFrames()
+def test_the_first_named_frame_stays_and_a_required_one_holds_before_any_is_known():
+    frames, of_tracks = KnownFrames(), measurements.ArrayDepth
     for frame_id in ('map', ''):
         with pytest.raises(Rejection, match=f"'{frame_id}' is not the frame 'harbour' of the tr"):
             frames.check(fix(frame_id), 'harbour')
     frames.check(fix('harbour'), 'harbour')
     frames.check(Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter'), 'harbour')
     assert frames.frame_id == ''
+    for frame_id in ('', 'map', 'map'):
+        frames.admit(fix(frame_id))
+    with pytest.raises(Rejection) as caught:
+        frames.admit(fix('odom'))
+    assert caught.value.sentence == "the frame 'odom' is not the frame 'map' of the tracks"
+    assert caught.value.reason == reason(frames.admit, fix('')) == 'frame'
+    frames.admit(of_tracks(stamp_ns=1, depth=30.0, frame_id='buoy'))  # one in any frame
+    assert frames.frame_id == 'map'
 
 
 def test_what_sensors_on_board_say_is_in_frames_of_their_own():

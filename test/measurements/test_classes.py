@@ -97,11 +97,19 @@ def test_a_single_number_that_is_not_finite_is_refused(kind):
             kind(stamp_ns=1, **values)
 
 
-def test_one_axis_that_is_not_measured_is_enough():
+def test_an_axis_that_is_not_measured_or_of_which_nothing_is_said():
     for variances in ((np.inf, 1.0), (1.0, np.inf), (np.inf, np.inf)):
         with pytest.raises(Rejection, match='states that x or y is not measured') as caught:
             check_flat(np.diag(variances), 'a fix')
         assert caught.value.reason == 'not_measured'
+    # A variance of z is stated up to one that says that it is not.
+    for variance, stated in ((0.999 * UNKNOWN_VARIANCE, True), (UNKNOWN_VARIANCE, False)):
+        made = Fix(stamp_ns=1, position=np.zeros(3), covariance=np.diag([1.0, 1.0, variance]))
+        assert np.isfinite(made.covariance[2, 2]) == stated
+    assumed, stated = np.diag([1.0, 2.0, 3.0]), by_axis(np.diag([4.0, -1.0, 9.0]))
+    whole = np.diag([4.0, 2.0, 9.0])
+    for given, wanted in ((None, assumed), (np.zeros((3, 3)), assumed), (stated, whole)):
+        np.testing.assert_array_equal(filled(given, assumed), wanted)
 
 
 @pytest.mark.parametrize('z', [np.nan, 1.0])
@@ -116,19 +124,6 @@ def test_a_fix_and_a_scan_take_the_same_covariances_of_x_and_y(a, b, c, d, good,
         Fix(stamp_ns=1, position=np.zeros(3), covariance=whole)
     with contextlib.nullcontext() if good else pytest.raises(Rejection):
         measurements.Fixes(stamp_ns=1, position=np.zeros((1, 3)), covariance=whole[None])
-
-
-def test_a_variance_of_z_is_stated_up_to_one_that_says_that_it_is_not():
-    for variance, stated in ((0.999 * UNKNOWN_VARIANCE, True), (UNKNOWN_VARIANCE, False)):
-        made = Fix(stamp_ns=1, position=np.zeros(3), covariance=np.diag([1.0, 1.0, variance]))
-        assert np.isfinite(made.covariance[2, 2]) == stated
-
-
-def test_an_axis_of_which_nothing_is_said_gets_what_is_assumed():
-    assumed, stated = np.diag([1.0, 2.0, 3.0]), by_axis(np.diag([4.0, -1.0, 9.0]))
-    whole = np.diag([4.0, 2.0, 9.0])
-    for given, wanted in ((None, assumed), (np.zeros((3, 3)), assumed), (stated, whole)):
-        np.testing.assert_array_equal(filled(given, assumed), wanted)
 
 
 # -- snapshots of an array ------------------------------------------------------------------------
@@ -191,8 +186,7 @@ def test_bins_that_are_spoilt_or_of_another_size_are_kept_and_marked():
 def test_variances_that_are_none_become_unknown():
     for value in (5e-324, 1e-200, 1e200, np.inf, 0.0, -1.0):
         assert snapshot(noise_variance=np.full(20, value)).noise_variance is None
-    variances = np.full(20, 2.0)
-    variances[:3] = [0.0, -1.0, np.inf]
+    variances = np.append([0.0, -1.0, np.inf], np.full(17, 2.0))
     ping = snapshot(noise_variance=variances, signal_variance=np.zeros(20))
     assert np.isnan(ping.noise_variance[:3]).all() and (ping.noise_variance[3:] == 2.0).all()
     assert ping.signal_variance is None
@@ -202,9 +196,8 @@ def test_ranges_of_times_and_the_spacing_in_wavelengths_follow_the_sound_speed()
     """Ranges those of the sonar, where it knows it."""
     time = (17.0 + 0.05 * np.arange(20)) / 750.0
     assert np.allclose(snapshot(two_way_time=time).ranges(1480.0), 740.0 * time)
-    known = snapshot(two_way_time=time, sound_speed=1500.0)
-    assert (known.ranges(1480.0) == known.range).all()
-    assert (snapshot().ranges(1480.0) == snapshot().range).all()
+    for known in (snapshot(two_way_time=time, sound_speed=1500.0), snapshot()):
+        assert (known.ranges(1480.0) == known.range).all()
     array = {'element_spacing': 0.00165, 'frequency': 455e3}
     assert snapshot(**array, sound_speed=1500.0).spacing_wavelengths == pytest.approx(0.5005)
     assert snapshot(**array).spacing_wavelengths is None
@@ -347,13 +340,9 @@ def test_a_hydrophone_with_a_lost_sample_is_masked():
     p = samples()
     p[7, 1], p[:, 3] = np.nan, 2.5
     item = Pressure(stamp_ns=1, pressure=p, sample_rate=100.0)
-    assert reason_of(Pressure, pressure=p, sample_rate=100.0, stamp_ns=0) == 'bad_stamp'
     assert item.alive.tolist() == [True, False, True, False, True]
     assert np.isfinite(item.pressure).all()
     assert item.duration_ns == 500_000_000
-
-
-def test_depths_of_the_array():
-    assert measurements.ArrayDepth(stamp_ns=1, depth=73.5).depth == 73.5
-    assert reason_of(measurements.ArrayDepth, depth=np.nan) == 'nan'
-    assert reason_of(measurements.ArrayDepth, depth=1e6) == 'out_of_range'
+    assert reason_of(Pressure, pressure=p, sample_rate=100.0, stamp_ns=0) == 'bad_stamp'
+    for depth, code in ((np.nan, 'nan'), (1e6, 'out_of_range')):
+        assert reason_of(measurements.ArrayDepth, depth=depth) == code

@@ -99,13 +99,23 @@ def test_writing_and_reading_gives_the_same_detections():
         assert np.isnan(again.var_bearing).all()
 
 
-def test_a_cloud_of_points_is_read_by_x_y_z_and_drawn_with_port_on_the_left():
+def test_places_are_read_by_x_y_z_and_drawn_with_port_on_the_left():
     ping = read_detections(table(x=[3.0, 0.0], y=[4.0, -2.0], z=[12.0, 0.0]))
     assert ping.range.tolist() == [13.0, 2.0]
     assert ping.bearing == pytest.approx([np.arctan2(4.0, 3.0), -np.pi / 2])
     message = written(Detections(stamp_ns=1, range=[10.0], bearing=[PORT]))
     x, y = np.frombuffer(bytes(message.data), '<f4')[:2]
     assert x > 9.0 and y == pytest.approx(10.0 * np.sin(PORT))
+    ping = adapters.read_pose_array(pose_array((4.0, 3.0, 0.0), (np.nan, 0.0, 0.0), (0.0,) * 3))
+    assert ping.range.tolist() == [5.0] and ping.bearing == pytest.approx([np.arctan2(3, 4)])
+    # The older point cloud.
+    places = [(4.0, 3.0, 0.0), (np.nan, 0.0, 0.0), (6.0, -8.0, 0.0)]
+    message = point_cloud(places, other=[9.0, 9.0, 9.0], intensities=[1.0, 2.0, 3.0])
+    ping = adapters.read_point_cloud(message)
+    assert ping.range.tolist() == [5.0, 10.0] and ping.intensity.tolist() == [1.0, 3.0]
+    assert ping.bearing == pytest.approx([np.arctan2(3, 4), np.arctan2(-8, 6)])
+    ping = adapters.read_point_cloud(point_cloud(places[:1], intensity=[1.0, 2.0]))
+    assert np.isnan(ping.intensity).all()
 
 
 def test_rows_that_are_no_echo_are_dropped_and_variances_that_were_not_filled_in_unknown():
@@ -216,18 +226,6 @@ def test_the_rays_of_a_laser_scan_have_times_and_its_stamp_is_the_last_one():
     assert_array_equal(again.time_offset, ping.time_offset)
 
 
-def test_places_of_poses_and_of_the_older_point_cloud():
-    ping = adapters.read_pose_array(pose_array((4.0, 3.0, 0.0), (np.nan, 0.0, 0.0), (0.0,) * 3))
-    assert ping.range.tolist() == [5.0] and ping.bearing == pytest.approx([np.arctan2(3, 4)])
-    places = [(4.0, 3.0, 0.0), (np.nan, 0.0, 0.0), (6.0, -8.0, 0.0)]
-    message = point_cloud(places, other=[9.0, 9.0, 9.0], intensities=[1.0, 2.0, 3.0])
-    ping = adapters.read_point_cloud(message)
-    assert ping.range.tolist() == [5.0, 10.0] and ping.intensity.tolist() == [1.0, 3.0]
-    assert ping.bearing == pytest.approx([np.arctan2(3, 4), np.arctan2(-8, 6)])
-    ping = adapters.read_point_cloud(point_cloud(places[:1], intensity=[1.0, 2.0]))
-    assert np.isnan(ping.intensity).all()
-
-
 def test_boxes_in_three_dimensions_have_an_elevation():
     up, port = np.radians(5.0), np.radians(20.0)
     axis = [np.cos(up) * np.cos(port), np.cos(up) * np.sin(port), np.sin(up)]
@@ -276,12 +274,6 @@ def test_a_sender_that_counts_to_the_other_side_is_turned_round():
             read(message, bearing_positive='left')
 
 
-def test_bad_flags_and_ranges_are_dropped():
-    ranges = [5.0, np.inf, 7.0, np.nan, 9.0]
-    ping = read_sonar_ranges(marine.sonar_ranges(AXIS, ranges, [0, 0, 2, 0, 0], [3.0]))
-    assert ping.range.tolist() == [5.0, 9.0] and ping.intensity.tolist() == [3.0, 3.0]
-
-
 def test_two_way_times_become_ranges_and_starboard_angles_negative_bearings():
     message = marine.sonar_detections([0.04, 0.02], [-PORT, -STARBOARD], sound_speed=1480.0)
     ping = adapters.read_sonar_detections(marine.sent(message), sound_speed=1500.0)
@@ -293,3 +285,7 @@ def test_two_way_times_become_ranges_and_starboard_angles_negative_bearings():
         ping = adapters.read_sonar_detections(message, sound_speed=1450.0)
         assert ping.range == pytest.approx([14.5] * 2)
         assert ping.bearing == pytest.approx([-0.1] * 2)
+    # Bad flags and ranges are dropped.
+    ranges = [5.0, np.inf, 7.0, np.nan, 9.0]
+    ping = read_sonar_ranges(marine.sonar_ranges(AXIS, ranges, [0, 0, 2, 0, 0], [3.0]))
+    assert ping.range.tolist() == [5.0, 9.0] and ping.intensity.tolist() == [3.0, 3.0]

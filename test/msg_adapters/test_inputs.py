@@ -82,7 +82,7 @@ def check_measurement(item):
 def test_hostile_messages_are_refused_or_sound(system):
     entries = {entry.name: entry for entry in (*inputs_of(system), *made_inputs(system))}
     rng, given, read = np.random.default_rng(7), templates(system), 0
-    for k in range(200 * len(given)):
+    for k in range(120 * len(given)):
         name, type_name, message = given[k % len(given)]
         message = mutated(message, MUTATIONS[rng.integers(len(MUTATIONS))], rng)
         try:
@@ -92,7 +92,7 @@ def test_hostile_messages_are_refused_or_sound(system):
             continue
         check_measurement(item)
         read += 1
-    assert read > 80 * len(given)
+    assert read > 48 * len(given)
 
 
 def test_the_adapters_load_neither_rclpy_nor_rosbags():

@@ -11,6 +11,7 @@ import math
 import tracemalloc
 from types import SimpleNamespace
 
+from helpers.diver_runs import arrivals
 from helpers.marine import sent
 from helpers.refusals import reason
 from hypothesis import given, HealthCheck, settings
@@ -22,7 +23,7 @@ from msg_adapters import scans, table
 from msg_adapters.arrivals import read_arrivals, REQUIRED, write_arrivals
 from msg_adapters.scans import read_scan
 from msg_adapters.table import decode_table, encode_table
-from sonar_imm.measurements import Arrivals, Fixes, Rejection
+from sonar_imm.measurements import Fixes, Rejection
 from sonar_imm_tools.recordings.messages import ros_message
 
 FORMATS = list(table.DATATYPES.values())
@@ -268,24 +269,23 @@ def test_a_table_is_read_and_turned():
     assert got.covariance[1, :2, :2].tolist() == [[9.0, 0.0], [0.0, 4.0]]
 
 
-def test_unknown_covariances_are_nan_in_their_rows():
+SPOILT = [
+    ('x', math.nan), ('x', 1e9), ('y', math.inf), ('cov_x_y', 2.0), ('cov_x_x', math.inf),
+    ('cov_x_x', 1e-300),
+]  # fmt: skip
+
+
+def test_rows_that_cannot_be_used_are_left_out_and_doubted():
+    for column, value in SPOILT:
+        message = scan(**{column: [value, decode_table(scan())[column][1]]})
+        assert read_scan(message).position.tolist() == [[3.0, 4.0, 0.0]]
+        assert doubted(message) == 'unusable_rows' and doubted(scan()) is None
+    # Unknown covariances are NaN in their rows.
     got = read_scan(scan(cov_x_x=[-1.0, 4.0]))
     assert np.isnan(got.covariance[0]).all()
     assert got.covariance[1, :2, :2].tolist() == [[4, 0], [0, 9]]
     zero = dict.fromkeys(('cov_x_x', 'cov_x_y', 'cov_y_y'), [0.0, 0.0])
     assert read_scan(scan(**zero)).covariance is None
-
-
-@pytest.mark.parametrize(
-    'column, value',
-    [('x', math.nan), ('x', 1e9), ('y', math.inf), ('cov_x_y', 2.0), ('cov_x_x', math.inf),
-     ('cov_x_x', 1e-300)],
-)  # fmt: skip
-def test_rows_that_cannot_be_used_are_left_out_and_doubted(column, value):
-    good = decode_table(scan())[column][1]
-    message = scan(**{column: [value, good]})
-    assert read_scan(message).position.tolist() == [[3.0, 4.0, 0.0]]
-    assert doubted(message) == 'unusable_rows' and doubted(scan()) is None
 
 
 def test_what_cannot_be_used_is_refused_with_its_reason():
@@ -357,44 +357,40 @@ def message(stamp_ns=10**18, frame_id='map', **changes):
 
 
 def test_missing_optional_columns_are_nan_and_bearings_are_wrapped():
-    arrivals = read_arrivals(message())
-    assert len(arrivals) == 3 and not arrivals.passive
-    assert np.isnan(arrivals.var_toa).all() and np.isnan(arrivals.bearing).all()
-    assert np.isnan(arrivals.var_bearing).all()
-    assert arrivals.toa.tolist() == np.linspace(0.1, 0.2, 3).tolist()
-    arrivals = read_arrivals(message(bearing=np.array([0.5, 1.5 * np.pi, np.nan])))
-    assert arrivals.bearing[0] == 0.5 and arrivals.bearing[1] == pytest.approx(-0.5 * np.pi)
-    assert np.isnan(arrivals.bearing[2])
+    heard = read_arrivals(message())
+    assert len(heard) == 3 and not heard.passive
+    assert np.isnan(heard.var_toa).all() and np.isnan(heard.bearing).all()
+    assert np.isnan(heard.var_bearing).all()
+    assert heard.toa.tolist() == np.linspace(0.1, 0.2, 3).tolist()
+    heard = read_arrivals(message(bearing=np.array([0.5, 1.5 * np.pi, np.nan])))
+    assert heard.bearing[0] == 0.5 and heard.bearing[1] == pytest.approx(-0.5 * np.pi)
+    assert np.isnan(heard.bearing[2])
 
 
-def test_bad_rows_are_dropped_one_by_one():
+def test_bad_rows_are_dropped_one_by_one_and_without_any_transmitter_the_target_emits():
     toa, spoilt = np.array([0.1, np.nan, 0.3, 0.4, 1e9, -0.1, 0.7]), np.zeros((2, 7))
     spoilt[0, 2], spoilt[1, 3] = np.inf, np.nan
-    arrivals = read_arrivals(message(rows=7, toa=toa, rx_y=spoilt[0], tx_x=spoilt[1]))
-    assert arrivals.rx_id.tolist() == [0, 6]
-
-
-def test_without_any_transmitter_the_target_emits():
+    heard = read_arrivals(message(rows=7, toa=toa, rx_y=spoilt[0], tx_x=spoilt[1]))
+    assert heard.rx_id.tolist() == [0, 6]
     nobody = dict.fromkeys(('tx_x', 'tx_y', 'tx_z'), np.full(3, np.nan))
-    arrivals = read_arrivals(message(**nobody, toa=np.array([0.0, -0.01, 0.2])))
-    assert arrivals.passive and len(arrivals) == 3
     # Nothing is known of the instant but that it is near the stamp.
-    arrivals = read_arrivals(message(**nobody, toa=np.array([0.0, -1e4, 0.2])))
-    assert arrivals.rx_id.tolist() == [0, 2]
+    for early, left in ((-0.01, [0, 1, 2]), (-1e4, [0, 2])):
+        heard = read_arrivals(message(**nobody, toa=np.array([0.0, early, 0.2])))
+        assert heard.passive and heard.rx_id.tolist() == left
 
 
 def test_variances_that_are_none_or_too_small_become_unknown():
     variances = np.float32([1e-6, 0.0, -1.0, np.nan, np.inf])
-    arrivals = read_arrivals(message(rows=5, var_toa=variances))
-    assert arrivals.var_toa[0] == np.float32(1e-6) and np.isnan(arrivals.var_toa[1:]).all()
+    heard = read_arrivals(message(rows=5, var_toa=variances))
+    assert heard.var_toa[0] == np.float32(1e-6) and np.isnan(heard.var_toa[1:]).all()
     for name, good, small in (
         ('toa', 1e-14, 1e-19),
         ('bearing', 1e-11, 1e-14),
         ('depth', 1e-7, 1e-11),
     ):
         variance = np.float32([good, small, good])
-        arrivals = read_arrivals(message(**{name: np.full(3, 0.1), f'var_{name}': variance}))
-        found = getattr(arrivals, f'var_{name}')
+        heard = read_arrivals(message(**{name: np.full(3, 0.1), f'var_{name}': variance}))
+        found = getattr(heard, f'var_{name}')
         assert np.isnan(found).tolist() == [False, True, False]
 
 
@@ -405,8 +401,8 @@ def test_elevation_and_depth_come_and_go():
     }  # fmt: skip
     values = {'depth': np.array([11.0, 11.0, np.inf]), 'var_depth': np.float32([0.04, 0.04, 0.0])}
     given = {name: np.asarray(column) for name, column in (known | values).items()}
-    arrivals = read_arrivals(message(**given))
-    for item in (arrivals, read_arrivals(write_arrivals(arrivals, ros_message))):
+    heard = read_arrivals(message(**given))
+    for item in (heard, read_arrivals(write_arrivals(heard, ros_message))):
         for name, column in known.items():
             np.testing.assert_array_equal(getattr(item, name), column)
     assert np.isnan(read_arrivals(message()).depth).all()
@@ -432,15 +428,14 @@ def test_arrivals_that_cannot_be_used_are_refused_with_their_reason():
         assert reason(read_arrivals, message(**changes)) == code
 
 
-@pytest.mark.parametrize('bearing', [np.full(2, np.nan), np.array([0.3, np.nan])])
-def test_writing_and_reading_gives_the_same_arrivals(bearing):
-    arrivals = Arrivals(
-        stamp_ns=10**18 + 1, tx_id=[0, 0], rx_id=[3, 65535], tx=np.full((2, 3), np.nan),
-        rx=[[1 / 3, 2.0, -1.0], [4.0, 5.0, 6.0]], toa=[0.0, 0.1],
-        var_toa=np.float32([1e-6, np.nan]), bearing=bearing,
-        var_bearing=np.float32(bearing * 0.1), frame_id='map',
-    )  # fmt: skip
-    again = read_arrivals(write_arrivals(arrivals, ros_message))
-    assert again.stamp_ns == arrivals.stamp_ns and again.frame_id == 'map'
-    for name in ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing'):
-        assert np.array_equal(getattr(again, name), getattr(arrivals, name), equal_nan=True), name
+def test_writing_and_reading_gives_the_same_arrivals():
+    for bearing in ([np.nan, np.nan], [0.3, np.nan]):
+        spread = {'bearing': bearing, 'var_bearing': np.float32(0.1 * np.array(bearing))}
+        heard = arrivals(
+            10**18 + 1, [[1 / 3, 2.0, -1.0], [4.0, 5.0, 6.0]], [0.0, 0.1], rx_id=[3, 65535],
+            var_toa=np.float32([1e-6, np.nan]), **spread,
+        )  # fmt: skip
+        again = read_arrivals(write_arrivals(heard, ros_message))
+        assert again.stamp_ns == heard.stamp_ns and again.frame_id == 'map'
+        for name in ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing'):
+            assert np.array_equal(getattr(again, name), getattr(heard, name), equal_nan=True), name

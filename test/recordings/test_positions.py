@@ -12,6 +12,7 @@ import json
 import math
 
 from helpers import marine
+from helpers.diver_runs import arrivals
 from helpers.marine import driver_message
 import numpy as np
 import pytest
@@ -245,11 +246,8 @@ def test_only_fixes_of_a_receiver_that_has_one_are_places(recorded):
 
 
 def ping():
-    nothing = dict.fromkeys(('var_toa', 'bearing', 'var_bearing'), [np.nan])
-    place = {'tx': [[0.0, 0.0, 0.0]], 'rx': [[1.0, 0.0, 0.0]], 'toa': [0.1], 'frame_id': 'map'}
-    return write_arrivals(
-        Arrivals(stamp_ns=10**18, tx_id=[0], rx_id=[1], **place, **nothing), ros_message
-    )
+    heard = arrivals(10**18, [[1.0, 0.0, 0.0]], [0.1], tx=[0.0, 0.0, 0.0], rx_id=[1])
+    return write_arrivals(heard, ros_message)
 
 
 @pytest.fixture

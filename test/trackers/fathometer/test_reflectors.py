@@ -24,17 +24,10 @@ from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimation.set_members import Members
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer import multiples
+from sonar_imm.trackers.fathometer import reflectors as verbs
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.multiples import Multiples, RECORDS, Seen, ways_above
-from sonar_imm.trackers.fathometer.reflectors import (
-    Identified,
-    Identities,
-    nearest_ids,
-    Reflectors,
-    reflectors_of,
-    relative_amplitude,
-    sediment_depths,
-)
+from sonar_imm.trackers.fathometer.reflectors import Identified, Identities, Reflectors
 from sonar_imm.trackers.fathometer.response import Lattice, pulse_of, Response
 from sonar_imm.trackers.fathometer.tracker import FathometerTracker
 
@@ -54,14 +47,14 @@ def reflectors(depth, is_bottom):
 
 def test_depths_below_the_bottom_are_those_of_the_sediment():
     config = FathometerConfig(sediment_sound_speed=1600.0, sediment_sound_speed_std=80.0)
-    depth, std = sediment_depths(reflectors([55.0, 60.0, 100.0], [0.2, 0.8, 0.0]), config)
+    depth, std = verbs.sediment_depths(reflectors([55.0, 60.0, 100.0], [0.2, 0.8, 0.0]), config)
     thickness = 40.0 * 1600.0 / 1500.0
     assert depth == pytest.approx([55.0, 60.0, 60.0 + thickness], abs=1e-12)
     assert std == pytest.approx([0.1, 0.1, np.hypot(0.1, 0.05 * thickness)])
     # Without a speed it is as the water.
-    depth, std = sediment_depths(reflectors([60.0, 100.0], [1.0, 0.0]), FathometerConfig())
+    depth, std = verbs.sediment_depths(reflectors([60.0, 100.0], [1.0, 0.0]), FathometerConfig())
     assert depth == pytest.approx([60.0, 100.0]) and std == pytest.approx([0.1, 0.1])
-    nothing = sediment_depths(reflectors([], []), FathometerConfig())
+    nothing = verbs.sediment_depths(reflectors([], []), FathometerConfig())
     assert [len(each) for each in nothing] == [0, 0]
 
 
@@ -113,27 +106,29 @@ def test_where_the_window_leaves_nothing_amplitudes_are_not_relative():
     grid = np.arange(0.0, 100.0, 1.0)
     # In a snapshot of 0.1 s sound goes to 75 m and back.
     response = Response(1, 'a', grid, grid, grid, 0.0, aperture=3.0, snapshot_seconds=0.1)
-    relative = relative_amplitude(found, response, config)
+    relative = verbs.relative_amplitude(found, response, config)
     assert relative[0] == pytest.approx((2.0 * 20.0 + 3.0) / (1.0 - 40.0 / 150.0))
     assert np.isnan(relative[1])
     # Freed of spreading over the height that is true.
     response = Response(1, 'a', grid, grid, grid, 25.0)
     for heave, height in ((0.0, 30.0), (0.5, 30.5)):
         found = evolve(reflectors([55.0], [1.0]), heave=heave, heave_std=0.1)
-        relative = relative_amplitude(found, response, FathometerConfig())
+        relative = verbs.relative_amplitude(found, response, FathometerConfig())
         assert relative == pytest.approx([2.0 * height])
 
 
 def test_what_was_lost_does_not_take_over_from_what_is_still_seen():
     """Reflector 6 was lost five records ago, a hand's breadth nearer than 7 was a record ago."""
     config = FathometerConfig(depth_std=0.1)
-    lost, seen = Identified(6, 22.78, 4), Identified(7, 22.92, 0)
-    assert list(nearest_ids(np.array([22.83]), [lost, seen], config)) == [7]
+    lost, seen = (Identified(6, 22.78, 4), Identified(7, 22.92, 0))
+    assert list(verbs.nearest_ids(np.array([22.83]), [lost, seen], config)) == [7]
     # Far more probable where it was than a walk of four standard deviations.
-    assert list(nearest_ids(np.array([22.53]), [Identified(6, 22.54, 4), seen], config)) == [6]
+    assert list(verbs.nearest_ids(np.array([22.53]), [Identified(6, 22.54, 4), seen], config)) == [
+        6
+    ]
     # Of two that were seen equally long ago the nearest, whatever the order.
     for earlier in ([seen, Identified(8, 22.8, 0)], [Identified(8, 22.8, 0), seen]):
-        assert list(nearest_ids(np.array([22.84, 23.0]), earlier, config)) == [8, 7]
+        assert list(verbs.nearest_ids(np.array([22.84, 23.0]), earlier, config)) == [8, 7]
 
 
 def test_a_reflector_is_waited_for_as_many_records_as_is_told():
@@ -161,7 +156,7 @@ def test_members_of_sets_become_metres_and_amplitudes_with_what_is_not_known_of_
     lattice = Lattice(50.0, 0.1, 200)
     sigma = 2.0 + np.arange(200) / 100.0
     response = Response(1, 'array', lattice.depth, np.zeros(200), sigma)
-    found = reflectors_of(members(2), response, lattice, pulse_of(config), config)
+    found = verbs.reflectors_of(members(2), response, lattice, pulse_of(config), config)
     assert found.depth == pytest.approx([52.0, 54.0])
     assert found.amplitude == pytest.approx(5.0 * sigma[[20, 40]])
     for covariance, noise in zip(found.covariance, sigma[[20, 40]]):
@@ -173,7 +168,7 @@ def test_members_of_sets_become_metres_and_amplitudes_with_what_is_not_known_of_
     # Where heave is a state the particles are spread by it, and the noise is that of the place
     # where the echo lies in the record.
     known = response, lattice, pulse_of(config), config
-    heaved = reflectors_of(members(2), *known, heave=(1.0, 0.25))
+    heaved = verbs.reflectors_of(members(2), *known, heave=(1.0, 0.25))
     assert heaved.covariance[:, 0, 0] == pytest.approx(0.1**2 * (0.25 + 1.0 / 12.0))
     assert heaved.amplitude == pytest.approx(5.0 * sigma[[30, 50]])
     assert (heaved.heave, heaved.heave_std) == (1.0, 0.25)
@@ -203,7 +198,7 @@ def test_pmf_of_what_is_detectable_is_that_of_independent_reflectors():
 
 
 def test_strength_is_a_mean_of_the_last_twenty_records():
-    known, here = Identities(), (np.array([10.0]), np.ones(1), FathometerConfig())
+    known, here = (Identities(), (np.array([10.0]), np.ones(1), FathometerConfig()))
     for strength in [3.0] * 30 + [5.0]:
         known, _ = known.name(*here, strength=np.array([strength]))
     (only,) = known.reflectors

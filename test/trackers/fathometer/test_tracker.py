@@ -125,18 +125,6 @@ def test_the_uncertainty_of_amplitudes_is_that_of_their_errors(memory, expected)
     assert np.median(variance) == pytest.approx(expected * 1.3e-3**2, rel=0.1)
 
 
-@pytest.mark.statistics
-def test_what_came_later_corrects_an_estimate(vectors):
-    now, later = (
-        score_scene(
-            run(traces(vectors, range(80, 280)), particles=3000, seed=4, smoothing_lag=lag)[1],
-            there(vectors),
-        )
-        for lag in (0, 2)
-    )
-    assert later.right > now.right and later.ospa <= now.ospa + 0.003
-
-
 def test_noise_alone_has_no_reflector():
     rng, depth = np.random.default_rng(0), np.arange(100.0, 150.0, 0.1)
     noise = [
