@@ -9,6 +9,8 @@
 """Every node: live is offline, hostile input is refused, services answer. And what the nodes of a
 swath and of an array publish besides."""
 
+from importlib import import_module
+
 from helpers.node_bench import Driven
 from helpers.scenes import SMALL, smaller_scene
 from nav_msgs.msg import Odometry
@@ -26,7 +28,6 @@ from msg_adapters.navigation import write_navigation
 from msg_adapters.snapshots import write_snapshot
 from msg_adapters.soundings import read_soundings
 from sonar_imm.measurements import Navigation, Pressure
-from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.bathymetry import BathymetryNode
 from sonar_imm.nodes.fathometer import FathometerNode
 from sonar_imm.nodes.messages import make, message_class
@@ -54,7 +55,8 @@ class Fed(Driven):
         for name, value in settings.items():
             given = list(value) if isinstance(value, tuple) else value
             overrides.append(Parameter(name, value=given))
-        node = bench.start(TrackerNode, system.name, parameter_overrides=overrides)
+        kind = getattr(import_module(system.node), f'{system.name.capitalize()}Node')
+        node = bench.start(kind, parameter_overrides=overrides)
         inputs = {topic.measurement: topic for topic in inputs_of(system.name)}
         given = [item.measurement for item in scene.measurements[:MESSAGES]]
         self.messages = [(inputs[type(m)], inputs[type(m)].write(m, make)) for m in given]
