@@ -37,6 +37,7 @@ from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.simulation.bathymetry import simulator as swath
 from sonar_imm_tools.simulation.fathometer import simulator as array
 
+SHARES = {'model_probabilities': JointState}
 MESSAGES = 60
 MORE = ('obstacle', 'late'), ('fathometer', 'small'), ('fathometer', 'pressure')
 """Messages that come late, cross-spectra, pressure."""
@@ -111,15 +112,10 @@ def test_with_navigation_soundings_and_shares_are_published(make_bench):
     """One node for both sides; what `~/soundings` says is what the offline table holds."""
     bench = make_bench(p=['max_wait:=0.0', 'navigation:=required'])
     node = bench.start(BathymetryNode)
-    tables = bench.listen(PointCloud2, '/bathymetry/estimate', lockstep_qos())
-    clouds = bench.listen(PointCloud2, '/bathymetry/soundings', lockstep_qos())
-    shares = bench.listen(JointState, '/bathymetry/model_probabilities', lockstep_qos())
+    kinds = {**dict.fromkeys(('estimate', 'soundings'), PointCloud2), **SHARES}
+    tables, clouds, shares = bench.hear(node, lockstep_qos(), **kinds)
     types = {'port/snapshot': PointCloud2, 'starboard/snapshot': PointCloud2, 'nav': Odometry}
     publishers = {name: bench.publisher(kind, f'/{name}') for name, kind in types.items()}
-    outputs = ('estimate', 'soundings', 'model_probabilities')
-    bench.spin_until(
-        lambda: all(node.count_subscribers(f'/bathymetry/{name}') for name in outputs)
-    )
     values = {'pings': 2, 'ping_rate': 10.0, 'last_range': 24.0}
     scene = swath.simulate(swath.scenario('moving_two_sides', values), 3)
     for item in scene.measurements:
@@ -149,13 +145,8 @@ START = 1_700_000_000 * 10**9
 def test_traces_become_reflectors_with_ids_and_displays(make_bench):
     bench = make_bench(p=['particles:=2000'])
     node = bench.start(FathometerNode)
-    outputs = ('estimate', 'response', 'model_probabilities')
-    tables = bench.listen(PointCloud2, '/fathometer/estimate')
-    responses = bench.listen(PointCloud2, '/fathometer/response')
-    numbers = bench.listen(JointState, '/fathometer/model_probabilities')
-    bench.spin_until(
-        lambda: all(node.count_subscribers(f'/fathometer/{name}') for name in outputs)
-    )
+    kinds = {**dict.fromkeys(('estimate', 'response'), PointCloud2), **SHARES}
+    tables, responses, numbers = bench.hear(node, **kinds)
     values = {'records': 4, 'appearing': (), 'fading': (), 'layers': 4}
     scene = array.simulate(array.scenario('drift_traces', values), 3)
     measured = [item.measurement for item in scene.measurements]
