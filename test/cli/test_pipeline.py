@@ -31,10 +31,9 @@ from msg_adapters.inputs import inputs_of
 from sonar_imm.measurements import Detections, GeodeticFix, Navigation, Trace
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.offline.run_folder import RunFolder
-from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.measurements import fitting_topics, measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import quoted
-from sonar_imm_tools.recordings.topics import fitting_topics
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 from sonar_imm_tools.resources import shared_file
 
