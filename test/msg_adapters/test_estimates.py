@@ -88,15 +88,12 @@ def test_the_columns_are_those_of_the_contract():
         'prob_heading_000', 'prob_heading_022', 'prob_hover', 'track_id', 'track_state', 'nis',
     ]  # fmt: skip
     assert [field.datatype for field in message.fields] == [7] * 3 + [8] * 17 + [6, 2, 8]
-
-
-@pytest.mark.parametrize('gone', ['x', 'cov_px_vy', 'px'])
-def test_a_table_without_a_column_is_refused(gone):
-    columns = estimate().columns()
-    del columns[gone]
-    with pytest.raises(Rejection, match=gone) as caught:
-        read_estimate(table(columns))
-    assert caught.value.reason == 'missing_column'
+    for gone in ('x', 'cov_px_vy', 'px'):
+        columns = estimate().columns()
+        del columns[gone]
+        with pytest.raises(Rejection, match=gone) as caught:
+            read_estimate(table(columns))
+        assert caught.value.reason == 'missing_column'
 
 
 def test_odometry_shows_one_diver_with_velocity_in_the_world():
