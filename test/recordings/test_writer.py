@@ -20,8 +20,8 @@ import pytest
 from msg_adapters.estimates import read_estimate
 from sonar_imm.measurements import Fix
 from sonar_imm.truth import Received, Scene, TrueReflectors, TrueTrack, TruthTable
-from sonar_imm_tools.recordings import csv_writer
-from sonar_imm_tools.recordings.csv_writer import CsvWriter, FEW_ROWS, ROWS_IN_A_BLOCK
+from sonar_imm_tools.recordings import export
+from sonar_imm_tools.recordings.export import CsvWriter, FEW_ROWS, ROWS_IN_A_BLOCK
 from sonar_imm_tools.recordings.messages import cdr_of, decode_cdr, ros_message, typestore
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
@@ -169,14 +169,14 @@ def test_blocks_follow_one_another():
 
 @pytest.fixture
 def choose_again():
-    csv_writer._arrow.cache_clear()
+    export._arrow.cache_clear()
     yield
-    csv_writer._arrow.cache_clear()
+    export._arrow.cache_clear()
 
 
 def test_pyarrow_writes_them_where_it_is_there():
     pytest.importorskip('pyarrow')
-    assert csv_writer._arrow() is not None
+    assert export._arrow() is not None
 
 
 @pytest.mark.parametrize('digits', ['none', 'others'])
@@ -186,8 +186,8 @@ def test_the_same_bytes_without_pyarrow_or_one_of_other_digits(monkeypatch, choo
     else:
         pytest.importorskip('pyarrow')
         other = '_texts', lambda column, arrow: arrow.array(['1'] * len(column))
-        monkeypatch.setattr(csv_writer, *other)
-    assert csv_writer._arrow() is None
+        monkeypatch.setattr(export, *other)
+    assert export._arrow() is None
     assert written([SPREAD, SPREAD]) == plain([SPREAD, SPREAD])
 
 
