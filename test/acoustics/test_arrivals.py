@@ -34,9 +34,8 @@ TRUTH = np.array([22.0, 31.0])
 def problem(active, offset=0.0, bearings=2):
     active = np.array(active)
     tx = np.where(active[:, None], [5.0, -12.0, -3.0], RX)
-    path = multistatic.slant_range(TRUTH, RX, Z)[0] + np.where(
-        active, multistatic.slant_range(TRUTH, tx, Z)[0], offset
-    )
+    sent, path = (multistatic.slant_range(TRUTH, place, Z)[0] for place in (tx, RX))
+    path = path + np.where(active, sent, offset)
     seen = multistatic.bearing(TRUTH, RX[:bearings])
     return ArrivalFit(
         tx=tx, rx=RX, active=active, bearing_rx=RX[:bearings],
@@ -99,8 +98,7 @@ def test_tag_search_is_never_worse_than_one_begun_at_the_truth(seed):
         target_z=-5.0, max_range=1e4,
     )  # fmt: skip
     found = minimise(fit, fit.starts(fit.weight), fit.weight).distinct()
-    begun = minimise(fit, truth[None], fit.weight)
-    assert found.cost[0] <= 1.001 * begun.cost[0] + 1e-3
+    assert found.cost[0] <= 1.001 * minimise(fit, truth[None], fit.weight).cost[0] + 1e-3
 
 
 def test_runs_that_leave_for_infinity_end():
@@ -181,22 +179,17 @@ def test_coincident_points_give_no_information_and_no_nan(distance):
     assert_allclose(multistatic.range_sum_jacobian(point[0, :2], point, point, -5.0), 0.0)
 
 
-SOUND_SPEED = 1480.0
-
-
 def test_emission_time_and_its_variance_are_those_of_the_joint_estimate():
+    speed = 1480.0
     variance = np.linspace(0.5, 2.0, len(RX)) * 1e-7
     length, direction = multistatic.slant_range(TRUTH, RX, -4.0)
-    known = {'target_z': -4.0, 'sound_speed': SOUND_SPEED}
-    seen = length / SOUND_SPEED + 77.25, variance, RX, TRUTH
+    known = {'target_z': -4.0, 'sound_speed': speed}
+    seen = length / speed + 77.25, variance, RX, TRUTH
     assert multistatic.emission_time(*seen, **known)[0] == pytest.approx(77.25, abs=1e-12)
-    augmented = np.column_stack([direction / SOUND_SPEED, np.ones(len(RX))])
+    augmented = np.column_stack([direction / speed, np.ones(len(RX))])
     joint = np.linalg.inv(augmented.T @ np.diag(1.0 / variance) @ augmented)
     _, stated = multistatic.emission_time(*seen, **known, covariance=joint[:2, :2])
     assert stated == pytest.approx(joint[2, 2], rel=1e-9)
-
-
-# -- paths and angles in three dimensions ---------------------------------------------------------
 
 
 def test_the_paths_of_the_vectors():
@@ -256,7 +249,6 @@ def test_the_form_for_many_states_equals_the_plain_one_and_its_gradient_the_diff
 
 
 def test_measurements_of_all_kinds_at_once_are_those_of_each_kind():
-    """Each with errors of its own receiver, or none."""
     kind = np.array([arrivals.HEIGHT, *DIRECTED, arrivals.PATH])
     rng = np.random.default_rng(5)
     tx, rx = rng.uniform(-80.0, 80.0, (2, 6, 3))

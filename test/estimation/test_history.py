@@ -80,7 +80,6 @@ def test_states_are_bounded_and_any_order_gives_the_same(stamps, limit):
     st.lists(st.tuples(st.integers(0, 60), st.binary(max_size=1)), max_size=40), st.integers(0, 12)
 )
 def test_any_order_equals_the_accepted_items_sorted(arrivals, window):
-    """Even when some are too late, the answer is that of the accepted ones alone, in order."""
     history = ReplayHistory(b'', window)
     final, verdicts = run(history, arrivals)
     used = [arrival for arrival, verdict in zip(arrivals, verdicts) if verdict == 'used']
@@ -125,9 +124,6 @@ def test_a_step_that_raises_leaves_the_history_as_it_was():
     assert revised[-1][1] == sorted_truth([(1, b'a'), (3, b'c'), (5, b'b')])[5]
 
 
-# -- the stamp gate --------------------------------------------------------------------------
-
-
 def gate(restart_after=3):
     return StampGate(window_ns=10 * S, max_gap_ns=100 * S, restart_after=restart_after)
 
@@ -136,26 +132,20 @@ def decide(stamp_gate, *seconds):
     return [stamp_gate.decide(int(s * S), s) for s in seconds]
 
 
-VERDICTS = {'u': 'use', 'l': 'too_late', 'd': 'doubtful'}
-
-
-@pytest.mark.parametrize(
-    'arrivals, verdicts, abandoned',
-    [
-        ([1000, 1010, 1000, 1110, 1100], 'uuuuu', 0),  # late by no more than the window
-        ([1000, 989.999], 'ul', 0),
-        ([1000, 1001, 9_000_000, 1002, 1003], 'uuduu', 1),
-        ([1000, 9_000_000, 5, 8_000_000, 600, 7_000_000, 1001], 'udldldu', 3),  # no two agree
-        ([s for i in range(20) for s in (1000 + i, 5 + i)], 20 * 'ul', 0),  # good ones between
-        ([1000, *[9_000_000] * 50, 1001], 'u' + 50 * 'd' + 'u', 50),  # a scan of many items
-    ],
-)
+@pytest.mark.parametrize('arrivals, verdicts, abandoned', [
+    ([1000, 1010, 1000, 1110, 1100], 'uuuuu', 0),  # late by no more than the window
+    ([1000, 989.999], 'ul', 0),
+    ([1000, 1001, 9_000_000, 1002, 1003], 'uuduu', 1),
+    ([1000, 9_000_000, 5, 8_000_000, 600, 7_000_000, 1001], 'udldldu', 3),  # no two agree
+    ([s for i in range(20) for s in (1000 + i, 5 + i)], 20 * 'ul', 0),  # good ones between
+    ([1000, *[9_000_000] * 50, 1001], 'u' + 50 * 'd' + 'u', 50),  # a scan of many items
+])  # fmt: skip
 def test_stamps_that_are_off_restart_nothing(arrivals, verdicts, abandoned):
+    words = {'u': 'use', 'l': 'too_late', 'd': 'doubtful'}
     decisions = decide(gate(), *arrivals)
-    assert [d.verdict for d in decisions] == [VERDICTS[letter] for letter in verdicts]
-    assert [d.released for d in decisions if d.verdict == 'use'] == [
-        (s,) for s, letter in zip(arrivals, verdicts) if letter == 'u'
-    ]
+    assert [d.verdict for d in decisions] == [words[letter] for letter in verdicts]
+    used = [(s,) for s, letter in zip(arrivals, verdicts) if letter == 'u']
+    assert [d.released for d in decisions if d.verdict == 'use'] == used
     assert sum(d.abandoned for d in decisions) == abandoned
 
 

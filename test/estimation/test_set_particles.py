@@ -67,15 +67,12 @@ def test_the_pmf_and_the_evidence_are_the_exact_ones(model, exact):
     assert np.abs(intensity - exact['exI']).sum(axis=1).mean() < 0.06
 
 
-@pytest.mark.parametrize(
-    'change',
-    [
-        {'amplitude_prior': 'bic_half'},
-        {'amplitude_prior': 'paper', 'transition': ASYMMETRIC},
-        {'shift': Shift(std=2.0, step=2), 'negative_probability': 0.3, 'amplitude_memory': 0.9},
-        {'jump': JUMP, 'negative_probability': 0.3, 'amplitude_memory': 0.9},
-    ],
-)
+@pytest.mark.parametrize('change', [
+    {'amplitude_prior': 'bic_half'},
+    {'amplitude_prior': 'paper', 'transition': ASYMMETRIC},
+    {'shift': Shift(std=2.0, step=2), 'negative_probability': 0.3, 'amplitude_memory': 0.9},
+    {'jump': JUMP, 'negative_probability': 0.3, 'amplitude_memory': 0.9},
+])  # fmt: skip
 def test_likelihoods_are_those_of_the_definition_and_amplitudes_go_with_members(
     model, exact, change
 ):
@@ -245,9 +242,6 @@ def test_models_that_cannot_be_are_refused(model):
     assert [model.room(m) for m in (0, 1, 2)] == [1, 60, pairs]
 
 
-# -- members from the intensity of many sets ------------------------------------------------------
-
-
 def hills(*places):
     sums = np.zeros((5, 100))
     for place, mass, amplitude in places:
@@ -298,8 +292,6 @@ def test_of_two_humps_the_greater_is_reported_with_its_own_spread():
         assert np.array_equal(found, expected)
 
 
-# -- sets over the time of several records, against as many steps of one --------------------------
-
 CELLS, SETS = 400, 20_000
 
 
@@ -322,7 +314,6 @@ def test_the_sum_of_walks_is_their_convolution():
 
 @pytest.mark.parametrize(('least', 'records'), [(0, 1), (3, 7)])
 def test_who_left_and_was_replaced(least, records):
-    """Against members that are drawn one by one."""
     P = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.3, 0.1, 0.6]])
     found = set_model.turnover(P, least, records)
     orders = found.reshape(3, -1, 3).sum(axis=1)
@@ -366,7 +357,6 @@ def prior(wide, steps, records):
 
 
 def test_one_long_step_is_as_several_short_ones(wide):
-    """The order, whether a member is still there, and how far it has walked."""
     at_once, by_steps = prior(wide, 1, 5), prior(wide, 5, 1)
     assert at_once[0] == pytest.approx(by_steps[0], abs=0.02)
     assert at_once[1] == pytest.approx(by_steps[1], abs=0.02) and at_once[1] < 0.95
@@ -375,7 +365,6 @@ def test_one_long_step_is_as_several_short_ones(wide):
 
 @pytest.mark.parametrize('shift', [None, Shift(std=1.5, memory=0.9)])
 def test_proposals_after_a_gap_change_no_result(wide, shift):
-    """With those that look at the record and those that do not."""
     changed = evolve(wide, negative_probability=0.3, shift=shift)
     rng = np.random.default_rng(1)
     b = rng.standard_normal(changed.record_cells)
@@ -411,9 +400,6 @@ def test_amplitudes_and_shifts_are_forgotten_by_the_time(wide):
     assert later.prior_mean[0, 0] == pytest.approx(2.0 * 0.9**3)
     fresh = (1.0 - 0.9**6) * wide.amplitude_std**2
     assert later.prior_variance[0, 0] == pytest.approx(0.9**6 * 0.5 + fresh)
-
-
-# -- the offset between members and the shift they share, drawn anew ------------------------------
 
 
 @pytest.mark.parametrize('step', [1, 4])

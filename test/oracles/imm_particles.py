@@ -128,9 +128,8 @@ def filter_bins(x, w, mu, models, chains, uniform, noise, echo, look, drift):
             kind = np.arange(M)
         for j in range(M):
             mixed[j, 0] = drift(mixed[j, 0], t)
-        x = propagate(
-            mixed, models.F[kind], (models.G * models.scale[t][:, None, None])[kind], noise[t]
-        )
+        G = models.G * models.scale[t][:, None, None]
+        x = propagate(mixed, models.F[kind], G[kind], noise[t])
         if echo[t]:
             w, mu, log_likelihood, _ = weigh(np.array([look(row, t) for row in x[:, 0]]), c)
         size = effective_sample_size(w, mu)

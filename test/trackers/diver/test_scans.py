@@ -30,8 +30,6 @@ from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simu
 
 ASSOCIATIONS = ('gnn', 'jipda')
 JIPDA = DiverConfig(association='jipda')
-
-
 SEEDS = [0, *(pytest.param(k, marks=pytest.mark.statistics) for k in (1, 2, 3))]
 
 
@@ -482,13 +480,10 @@ def test_densities_are_bounded():
     assert known.density == clutter.LEAST
 
 
-WARNS = [
+@pytest.mark.parametrize('false, half, settings, warns', [
     (6.0, 60.0, {}, True), (6.0, 60.0, {'clutter_density': 4e-4}, False),
     (6.0, 60.0, {'association': 'jipda'}, False), (0.1, 60.0, {}, False), (1.0, 900.0, {}, False),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize('false, half, settings, warns', WARNS)
+])  # fmt: skip
 def test_gnn_says_that_there_is_clutter(false, half, settings, warns):
     known = {'model_set': 'heading_speed', 'directions': 4, 'association': 'gnn'}
     tracker = DiverTracker(DiverConfig(**{**known, **settings}))

@@ -127,9 +127,8 @@ def test_the_uncertainty_of_amplitudes_is_that_of_their_errors(memory, expected)
 
 def test_noise_alone_has_no_reflector():
     rng, depth = np.random.default_rng(0), np.arange(100.0, 150.0, 0.1)
-    noise = [
-        Trace(stamp_ns=k, depth=depth, amplitude=rng.standard_normal(500)) for k in range(1, 30)
-    ]
+    samples = rng.standard_normal((29, 500))
+    noise = [Trace(stamp_ns=k, depth=depth, amplitude=row) for k, row in enumerate(samples, 1)]
     _, found = run(noise, pulse='gaussian', pulse_width=0.05, order_min=0, particles=2000)
     nothing = [each for each in found.values() if np.isnan(each.state[0, 0])]
     assert len(nothing) > 24
@@ -181,7 +180,6 @@ def test_the_same_input_gives_the_same_bytes(vectors):
 
 
 def test_strange_input_is_counted(vectors):
-    """A trace without noise, one that lies elsewhere later."""
     flat = Trace(stamp_ns=2, depth=np.arange(100.0), amplitude=np.ones(100))
     tracker, found = run([flat], particles=100)
     assert not found and tracker.counts['no_noise'] == 1
@@ -190,24 +188,20 @@ def test_strange_input_is_counted(vectors):
     assert run(given, particles=300)[0].counts['other_depths'] == 1
 
 
-@pytest.mark.parametrize(
-    'parameters, word',
-    [
-        ({'order_min': 9, 'order_max': 7}, 'order_max'),
-        ({**SEVEN, 'order_transition_matrix': [1.0]}, '2 x 2'),
-        ({**SEVEN, 'order_transition_matrix': [0.5, 0.5, 0.5, 0.6]}, 'row 1'),
-        ({'pulse': 'file'}, 'pulse_file'),
-        ({'frequency_min': 5000.0}, 'frequency_max'),
-        ({'depth_min': 50.0}, 'depth_max'),
-        ({'particles': 0}, 'particles'),
-        ({'particles': 10_000_000, 'order_max': 12}, 'memory'),
-        ({'heave': 'memory', 'array_depth_std': 0.0}, 'array_depth_std'),
-        ({'output': 'printed', 'processor': 'white_noise'}, 'printed'),
-        ({'noise_depth_min': 10.0, 'noise_depth_max': 0.0}, 'noise_depth_max'),
-        ({'negative_probability': 1.0}, 'negative_probability'),
-        ({'snapshot_seconds': 1e-4}, '0.001'),
-    ],
-)
+@pytest.mark.parametrize('parameters, word', [
+    ({'order_min': 9, 'order_max': 7}, 'order_max'),
+    ({**SEVEN, 'order_transition_matrix': [1.0]}, '2 x 2'),
+    ({**SEVEN, 'order_transition_matrix': [0.5, 0.5, 0.5, 0.6]}, 'row 1'),
+    ({'pulse': 'file'}, 'pulse_file'),
+    ({'frequency_min': 5000.0}, 'frequency_max'), ({'depth_min': 50.0}, 'depth_max'),
+    ({'particles': 0}, 'particles'),
+    ({'particles': 10_000_000, 'order_max': 12}, 'memory'),
+    ({'heave': 'memory', 'array_depth_std': 0.0}, 'array_depth_std'),
+    ({'output': 'printed', 'processor': 'white_noise'}, 'printed'),
+    ({'noise_depth_min': 10.0, 'noise_depth_max': 0.0}, 'noise_depth_max'),
+    ({'negative_probability': 1.0}, 'negative_probability'),
+    ({'snapshot_seconds': 1e-4}, '0.001'),
+])  # fmt: skip
 def test_configurations_that_cannot_be(parameters, word):
     with pytest.raises(ConfigError, match=word):
         FathometerConfig(**parameters)
@@ -233,16 +227,11 @@ FINE = Trace(stamp_ns=1, depth=DEPTH, amplitude=np.sin(DEPTH))
 """50,000 steps of a tenth of a millimetre: 400 kB."""
 
 
-@pytest.mark.parametrize(
-    'parameters',
-    [
-        {},
-        {'depth_std': 100.0, 'depth_step': 1e-3},
-        {'depth_step': 1e-9, 'depth_min': 50.0, 'depth_max': 50.0 + 1e-6},
-        {'depth_step': 1e-300},
-        {'heave': 'independent', 'array_depth_std': 1000.0, 'depth_std': 1e-3},
-    ],
-)
+@pytest.mark.parametrize('parameters', [
+    {}, {'depth_std': 100.0, 'depth_step': 1e-3},
+    {'depth_step': 1e-9, 'depth_min': 50.0, 'depth_max': 50.0 + 1e-6}, {'depth_step': 1e-300},
+    {'heave': 'independent', 'array_depth_std': 1000.0, 'depth_std': 1e-3},
+])  # fmt: skip
 def test_lattices_that_would_fill_the_memory_are_refused(parameters):
     """Tables of moves hold every cell times every distance a reflector can move by."""
     config = FathometerConfig(particles=100, **parameters)
