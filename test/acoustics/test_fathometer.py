@@ -220,10 +220,9 @@ def test_the_phase_of_an_echo_is_that_of_the_array_and_its_distance():
     frequency, heights = np.arange(100.0, 2800.0, 4.0), 0.25 * np.arange(16)
     w = fm.steering(frequency, heights, C)
     for H in (22.0, 40.0):
-        with_layer, without = (
-            ambient.surface_noise_csdm(frequency, 16, 0.25, [H], [a], C) + 0.01 * np.eye(16)
-            for a in (0.1, -0.1)
-        )
+        known = frequency, 16, 0.25, [H]
+        layers = (ambient.surface_noise_csdm(*known, [a], C) for a in (0.1, -0.1))
+        with_layer, without = (layer + 0.01 * np.eye(16) for layer in layers)
         changed = fm.coherence(with_layer, w, 'mvdr') - fm.coherence(without, w, 'mvdr')
         exact = np.angle(changed * np.exp(4j * np.pi * frequency * H / C))
         phase = fm.echo_phase(with_layer, frequency, heights, [H], C, 1e-2)[0]

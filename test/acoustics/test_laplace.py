@@ -287,10 +287,8 @@ def test_a_shadow_is_silent_and_an_echo_is_not():
 def test_for_two_staves_the_mean_decides():
     iq = circular(np.random.default_rng(5), 3000, 2)
     wave = 20.0 * circular(np.random.default_rng(6), 3000, 1) * array.steering(0.3, 2, 0.5)
-    silent, heard = (
-        coherence.silent_bins(coherence.coherence(each, 0.5)[0], 2).mean()
-        for each in (iq, iq + wave)
-    )
+    gammas = (coherence.coherence(each, 0.5)[0] for each in (iq, iq + wave))
+    silent, heard = (coherence.silent_bins(gamma, 2).mean() for gamma in gammas)
     assert silent > 0.99 and heard < 0.3
 
 

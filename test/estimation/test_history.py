@@ -204,11 +204,6 @@ BEYOND = [*range(5 * 10**9 - 50, 5 * 10**9)]
 LATE = [*range(1000, 1050)]
 
 
-def inside(rate):
-    """A clock that is set back by 250 s, told `rate` times a second."""
-    return [s + i / rate for s, n in ((1000, 500), (1250, 200)) for i in range(n * rate)]
-
-
 def restarts_at(after, arrivals, at, due=None, window=10, gap=600):
     """The restarts are at `at`, and `due` is released; None: everything."""
     decisions = decide(StampGate(window * S, gap * S, after), *arrivals)
@@ -227,7 +222,8 @@ def test_what_is_late_what_is_a_restart_and_what_comes_of_it():
     for back in (350, 3600, 10**9):  # one set back beyond any lateness is believed at once
         assert restarts_at(5, BEYOND + [5 * 10**9 - back + i for i in range(10)], [54])
     for rate, n in ((1, 100), (10, 102)):  # one set back inside the stream, after a long run
-        assert restarts_at(5, inside(rate), [500 * rate + n - 1])
+        stamps = [s + i / rate for s, k in ((1000, 500), (1250, 200)) for i in range(k * rate)]
+        assert restarts_at(5, stamps, [500 * rate + n - 1])
     for ahead in (20, 100, 299):  # an outlying first stamp inside the gap is outvoted
         assert restarts_at(5, [1000 + ahead, *LATE], [5], window=5)
     # A stray stamp puts off a restart: the run begins again after it.

@@ -311,7 +311,7 @@ def walk(steps=60):
     return np.array(truth)[:, :2] + noise, np.array(truth)
 
 
-def filterpy_imm():
+def test_equals_filterpy_on_an_asymmetric_chain():
     filters = []
     for rate, noise in ((0.0, 0.05), (0.15, 0.2)):
         kf = KalmanFilter(dim_x=4, dim_z=2)
@@ -319,11 +319,8 @@ def filterpy_imm():
         kf.F, kf.Q = turning(rate, 1.0), white_acceleration(noise**2, rate, 1.0)
         kf.H, kf.R = np.eye(2, 4), np.eye(2)
         filters.append(kf)
-    return IMMEstimator(filters, np.array([0.5, 0.5]), T)
-
-
-def test_equals_filterpy_on_an_asymmetric_chain():
-    imm, peer = IMM(MODELS, T, **START, measurement=position(1.0)), filterpy_imm()
+    peer = IMMEstimator(filters, np.array([0.5, 0.5]), T)
+    imm = IMM(MODELS, T, **START, measurement=position(1.0))
     for z in walk()[0]:
         imm.step(z)
         peer.predict()

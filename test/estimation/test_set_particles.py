@@ -56,13 +56,9 @@ def run(model, records, particles, seed):
     return np.array(pmfs), np.array(intensities), sum(evidence)
 
 
-def variation(pmf, exact):
-    return 0.5 * np.abs(pmf - exact['exP']).sum(axis=1).mean()
-
-
 def test_the_pmf_and_the_evidence_are_the_exact_ones(model, exact):
     pmf, intensity, evidence = run(model, exact['B'], 20_000, seed=1)
-    assert variation(pmf, exact) <= 0.008
+    assert 0.5 * np.abs(pmf - exact['exP']).sum(axis=1).mean() <= 0.008
     assert abs(evidence - EXACT_LOG_EVIDENCE) < 0.5
     assert np.abs(intensity - exact['exI']).sum(axis=1).mean() < 0.06
 
@@ -80,10 +76,8 @@ def test_likelihoods_are_those_of_the_definition_and_amplitudes_go_with_members(
     tracker, b = SetFilter(changed, N), np.pad(exact['B'][3], changed.pad)
     record = tracker.record(b, (1, 2))
     sets = tracker.start(record).sets
-    sets = sets._replace(
-        prior_mean=rng.uniform(0.5, 3.0, sets.cell.shape),
-        prior_variance=rng.uniform(0.5, 4.0, sets.cell.shape),
-    )
+    mean, variance = (rng.uniform(0.5, most, sets.cell.shape) for most in (3.0, 4.0))
+    sets = sets._replace(prior_mean=mean, prior_variance=variance)
     propagated = tracker.propagate(Weighted(sets, np.zeros(N)), record)
     moved, possible = propagated.sets, np.isfinite(propagated.log_weight)
     assert len(set(moved.order)) == 3

@@ -379,10 +379,6 @@ def layout_of(config):
     return Instruments().layout(config, build_models(config))
 
 
-def rows_of(models, x, P, mu):
-    return models.make_rows(x[None, None], P[None, None], mu[None, None], np.zeros((1, 1)))
-
-
 def test_the_image_is_that_of_an_independent_prototype():
     config = DiverConfig(covariance_scales=(1.0,))
     models, layout = build_models(config), layout_of(config)
@@ -391,7 +387,9 @@ def test_the_image_is_that_of_an_independent_prototype():
     line = sides.line_through(np.array([a, b]), 0.5)
     quiet = np.eye(len(models.names))[-1]
     each = np.tile(x, (len(quiet), 1)), np.tile(P, (len(quiet), 1, 1))
-    rows = sides.with_images(rows_of(models, *each, quiet), 0, models, layout, line)
+    parts = (part[None, None] for part in (*each, quiet))
+    rows = models.make_rows(*parts, np.zeros((1, 1)))
+    rows = sides.with_images(rows, 0, models, layout, line)
     parts = rows.blocks[1].x[..., -1], rows.blocks[1].P[..., -1]
     mean, covariance = rows.combine(*parts, rows.weight)
     np.testing.assert_allclose(parts[0][1], found['mirrored_x'], atol=1e-12)

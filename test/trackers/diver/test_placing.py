@@ -123,11 +123,9 @@ def test_navigation_that_nothing_needs_decides_nothing():
 
 def test_an_unknown_height_is_that_of_the_origin():
     config = DiverConfig(origin=(59.0, 10.0, 40.0))
-    known, unknown = (
-        run(DiverTracker(config), [geodetic(1, (2e4, 0.0, 0.0), **height)])[0].state
-        for height in ({'height': 40.0}, {'height': np.nan})
-    )
-    assert known.tolist() == unknown.tolist()
+    fixes = [geodetic(1, (2e4, 0.0, 0.0), height=height) for height in (40.0, np.nan)]
+    known, unknown = (run(DiverTracker(config), [each])[0].state.tolist() for each in fixes)
+    assert known == unknown
 
 
 FAR = Origin(10.0, 60.0)
@@ -365,10 +363,8 @@ def written(tmp_path, name, header, rows):
 
 
 def ids_by_scan(config, scans):
-    return [
-        estimate.extras['track_id'][estimate.extras['track_state'] > 0].tolist()
-        for estimate in followed(DiverTracker(config), scans)
-    ]
+    made = followed(DiverTracker(config), scans)
+    return [each.extras['track_id'][each.extras['track_state'] > 0].tolist() for each in made]
 
 
 @pytest.mark.parametrize('association, model_set', [

@@ -362,10 +362,8 @@ def missed(made):
 @pytest.mark.parametrize('seed', SEEDS[:2])
 def test_fixes_of_a_sensor_that_polls_are_gathered_to_scans(seed):
     """Tracks starve where each fix is a scan."""
-    *alone, made = (
-        run(DiverTracker(DiverConfig(**how)), polled(seed))
-        for how in ({'association': 'gnn'}, {'association': 'jipda'}, {'scan_period': 1.0})
-    )
+    each = {'association': 'gnn'}, {'association': 'jipda'}, {'scan_period': 1.0}
+    *alone, made = (run(DiverTracker(DiverConfig(**how)), polled(seed)) for how in each)
     gathered, ids = missed(made)
     assert min(missed(each)[0] for each in alone) > 0.3 and gathered < 0.01 and len(ids) == 3
     assert {item.stamp_ns % SECOND for item in made} == {SECOND // 2}
@@ -438,11 +436,8 @@ def test_what_is_stated_stays_and_gnn_learns_nothing():
     tracker = DiverTracker(evolve(JIPDA, model_set='heading_speed', clutter_density=1e-4))
     run(tracker, items)
     assert tracker._stream.state.memory['clutter'].by_sensor == ()
-    usual, stated = (
-        run(DiverTracker(DiverConfig(association='gnn', clutter_density=value)), items)
-        for value in (0.0, CLUTTER)
-    )
-    assert all(map(same, usual, stated))
+    configs = [DiverConfig(association='gnn', clutter_density=value) for value in (0.0, CLUTTER)]
+    assert all(map(same, *(run(DiverTracker(config), items) for config in configs)))
 
 
 def test_each_sensor_has_clutter_of_its_own():

@@ -143,10 +143,9 @@ def test_heave_and_the_speed_of_the_water_down_to_the_bottom_are_common(drawn):
     """Heave in place of the depth of the array; the water's speed to the bottom where the sediment
     has a speed of its own; else it is water."""
     depth, _, _, estimates = followed(drawn, heave='independent')
-    heave, stated, common = (
-        np.array([each.extras[name] for each in estimates])
-        for name in ('heave', 'heave_std', 'depth_common_std')
-    )
+    names = 'heave', 'heave_std', 'depth_common_std'
+    rows = (np.array([each.extras[name] for each in estimates]) for name in names)
+    heave, stated, common = rows
     height = depth + heave - ARRAY
     assert common**2 == pytest.approx(stated**2 + (height / 300.0) ** 2, rel=1e-9)
     depth, *_, water = followed(drawn)

@@ -150,10 +150,8 @@ def test_echoes_are_positive_and_where_they_should_be(spectra):
         assert depth[np.argmax(e)] == pytest.approx(LAYER, abs=0.2)
     # The conventional one is printed right.
     options = {'envelope': True, 'processor': 'conventional'}
-    e, c = (
-        received(spectra, 110.0, 140.0, output=output, **options)[1]
-        for output in ('printed', 'correlation')
-    )
+    known, names = (spectra, 110.0, 140.0), ('printed', 'correlation')
+    e, c = (received(*known, output=name, **options)[1] for name in names)
     assert e == pytest.approx(c, rel=1e-5)
 
 
