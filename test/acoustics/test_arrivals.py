@@ -29,6 +29,14 @@ RX = np.array(
     ]
 )  # fmt: skip
 TRUTH = np.array([22.0, 31.0])
+KINDS = {'active': [True] * 5, 'passive': [False] * 5, 'mixed': [True, False, True, False, False]}
+COORDINATE = st.floats(-300.0, 300.0)
+POINT = st.tuples(COORDINATE, COORDINATE, st.floats(-40.0, 0.0)).map(np.array)
+PLACE = st.tuples(COORDINATE, COORDINATE).map(np.array)
+quick = settings(max_examples=60, derandomize=True, deadline=None)
+COLUMNS = np.array([0, 1, 3, 5, 7, 8, 9])
+STATE = np.array([31.0, -12.0, 0.7, -9.0, 0.1, 0.6, -0.4, 0.8, 0.003, 4.0])
+DIRECTED = arrivals.PATH, arrivals.ONE_WAY, arrivals.BEARING, arrivals.ELEVATION
 
 
 def problem(active, offset=0.0, bearings=2):
@@ -42,9 +50,6 @@ def problem(active, offset=0.0, bearings=2):
         observed=np.concatenate([path, seen]), weight=np.linspace(1.0, 3.0, len(RX) + bearings),
         target_z=Z, max_range=1000.0,
     )  # fmt: skip
-
-
-KINDS = {'active': [True] * 5, 'passive': [False] * 5, 'mixed': [True, False, True, False, False]}
 
 
 @pytest.mark.parametrize('kind', KINDS)
@@ -118,12 +123,6 @@ def test_each_start_may_have_its_own_weights():
     assert minima.cost.argmin() == 2
     assert_allclose(minima.position[2], TRUTH, atol=1e-3)
     assert minima.cost[[0, 1, 3, 4]].min() > 1.0
-
-
-COORDINATE = st.floats(-300.0, 300.0)
-POINT = st.tuples(COORDINATE, COORDINATE, st.floats(-40.0, 0.0)).map(np.array)
-PLACE = st.tuples(COORDINATE, COORDINATE).map(np.array)
-quick = settings(max_examples=60, derandomize=True, deadline=None)
 
 
 def slope(function, position, step=1e-4):
@@ -216,18 +215,11 @@ def test_the_angles_of_the_vectors():
     assert_allclose(leg.by_position[0], v['out_jacobian_range'], atol=1e-9)
 
 
-COLUMNS = np.array([0, 1, 3, 5, 7, 8, 9])
-STATE = np.array([31.0, -12.0, 0.7, -9.0, 0.1, 0.6, -0.4, 0.8, 0.003, 4.0])
-
-
 def seen(kind, states, tx, rx, columns=COLUMNS, height=0.0):
     """What one measurement of a kind expects at states (L, n): values (L,), gradients (L, n)."""
     one = np.array([kind]), columns[None], tx[None], rx[None]
     value, gradient = arrivals.observe(np.atleast_2d(states).T, height, *one)
     return value[0], gradient[0].T
-
-
-DIRECTED = arrivals.PATH, arrivals.ONE_WAY, arrivals.BEARING, arrivals.ELEVATION
 
 
 @pytest.mark.parametrize('kind', [*DIRECTED, arrivals.HEIGHT])

@@ -30,6 +30,10 @@ from sonar_imm.acoustics.pulse import band_pulse
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer'
 C, M, D = 1500.0, 32, 0.18
 HEIGHTS = D * np.arange(M)
+PHONES, SPACING, SPEED = 16, 0.25, 1500.0
+WAVE, PLACES = SPEED / SPACING, np.arange(PHONES)
+FREQUENCY = np.arange(100.0, 2801.0, 10.0)
+LENGTH, HYDROPHONES = 64, 4
 
 
 @pytest.fixture(scope='module')
@@ -251,11 +255,6 @@ def test_the_power_of_few_snapshots_is_less_by_what_is_fitted():
     assert drawn / exact[0] == pytest.approx(expected.mean(), rel=0.08)
 
 
-PHONES, SPACING, SPEED = 16, 0.25, 1500.0
-WAVE, PLACES = SPEED / SPACING, np.arange(PHONES)
-FREQUENCY = np.arange(100.0, 2801.0, 10.0)
-
-
 def fitted(csdm, phones=PLACES, **options):
     return correct_phones(csdm, FREQUENCY, phones, WAVE, 0.1, **options)
 
@@ -469,9 +468,6 @@ def test_what_is_no_pulse_is_refused():
     for make, *values in ((pulses.band_pulse, 4000.0, 50.0, 1500.0), (pulses.gaussian_pulse, 0.0)):
         with pytest.raises(ValueError):
             make(*values)
-
-
-LENGTH, HYDROPHONES = 64, 4
 
 
 def pressure(samples=1000, seed=0):

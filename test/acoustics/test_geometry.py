@@ -30,6 +30,10 @@ from sonar_imm.acoustics.sounding import ErrorBudget
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'obstacle'
 EXACT = {'rtol': 0.0, 'atol': 1e-9}
+A, F = 6378137.0, 1.0 / 298.257223563
+E2 = F * (2.0 - F)
+PLACES = [(59.1, 10.2, 0.0), (-33.9, 151.2, 20.0), (0.001, -179.9999, -5.0), (78.2, 15.6, 3.0)]
+SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)
 
 
 def table(name):
@@ -150,10 +154,6 @@ def test_slerp_against_scipy():
     assert_allclose(np.degrees(on), [0.0, 0.0, 15.0], atol=1e-12)
 
 
-A, F = 6378137.0, 1.0 / 298.257223563
-E2 = F * (2.0 - F)
-
-
 def earth(latitude, longitude, height):
     """Earth-centred metres: the textbook formula."""
     phi, lam = math.radians(latitude), math.radians(longitude)
@@ -171,9 +171,6 @@ def numeric_axes(latitude, longitude, height=0.0, step=1e-4):
         earth(latitude, longitude, height + 1.0) - there,
     ]
     return np.array([column / np.linalg.norm(column) for column in columns]).T
-
-
-PLACES = [(59.1, 10.2, 0.0), (-33.9, 151.2, 20.0), (0.001, -179.9999, -5.0), (78.2, 15.6, 3.0)]
 
 
 @pytest.mark.parametrize('place', PLACES)
@@ -446,9 +443,6 @@ def test_what_the_geometry_leaves_open_is_what_an_error_does():
         vertical, horizontal = sounding.geometry_variance(*known, doubt)
         assert np.sqrt(vertical) == pytest.approx(np.abs(dz), rel=1e-3)
         assert np.sqrt(horizontal) == pytest.approx(np.abs(dy), rel=1e-3)
-
-
-SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)
 
 
 def cases():

@@ -19,6 +19,11 @@ from scipy.special import kve
 from sonar_imm.acoustics import array, coherence, interference, laplace
 
 STEP = array.phase_step(0.5)
+TILT = math.radians(30.0)
+STAVES, SPACING = 8, 0.5
+SINES = np.array([[0.3, -0.2], [0.1, np.nan], [0.5, 0.55]])
+VARIANCES = np.array([[5.0, 2.0], [3.0, 3.0], [0.0, 4.0]])
+NOISE = np.array([1.0, 0.5, 2.0])
 
 
 def circular(rng, *shape):
@@ -121,9 +126,6 @@ def test_the_likelihood_by_its_parts_is_that_of_the_definition(staves, spacing, 
     assert np.allclose(out[fine], expected[fine], rtol=3e-7, atol=1e-6)
 
 
-TILT = math.radians(30.0)
-
-
 @pytest.mark.parametrize('tilt', [-0.4, TILT, 1.2])
 def test_the_direction_sine_is_the_sine_of_the_angle(tilt):
     rng = np.random.default_rng(0)
@@ -179,12 +181,6 @@ def test_the_grid_covers_all_that_can_be_told_apart():
         grid = array.direction_grid(staves, spacing)
         assert grid[-1] == -grid[0] == array.largest_sine(spacing)
         assert np.diff(grid).max() <= 1.0 / (8 * staves * spacing) + 1e-12
-
-
-STAVES, SPACING = 8, 0.5
-SINES = np.array([[0.3, -0.2], [0.1, np.nan], [0.5, 0.55]])
-VARIANCES = np.array([[5.0, 2.0], [3.0, 3.0], [0.0, 4.0]])
-NOISE = np.array([1.0, 0.5, 2.0])
 
 
 @pytest.fixture

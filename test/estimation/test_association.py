@@ -28,6 +28,8 @@ from sonar_imm.estimation.linked_rows import linked_marginals, MOST_CLASSES
 from sonar_imm.estimation.marginals import clusters, log_total, marginals
 
 RULES = association.TrackRules(confirm_hits=3, confirm_window=5, delete_misses=2, max_coast_ns=100)
+POINTS = np.array([[0.0, 0.0], [10.0, 0.0]])
+NOTHING = np.empty((0, 2))
 
 
 def test_gates_and_bounds_are_quantiles():
@@ -227,10 +229,6 @@ def test_coverage_by_hand():
     high = low + [2.0, 1.0, 0.0, 0.2, 0.9]
     assert consistency.interval_coverage(truth, low, high) == pytest.approx(0.6)
     assert np.isnan(consistency.interval_coverage(np.empty(0), np.empty(0), np.empty(0)))
-
-
-POINTS = np.array([[0.0, 0.0], [10.0, 0.0]])
-NOTHING = np.empty((0, 2))
 
 
 @pytest.mark.parametrize('truth, estimate, expected', [

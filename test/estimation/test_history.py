@@ -18,6 +18,10 @@ import pytest
 from sonar_imm.estimation.history import ReplayHistory, StampGate
 
 S = 1_000_000_000
+HUNDRED, NEXT, THOUSAND = [*range(100, 200)], [*range(200, 300)], [*range(1000, 2000)]
+OUTAGE = *HUNDRED, 260, *range(200, 260), *range(261, 300)
+BEYOND = [*range(5 * 10**9 - 50, 5 * 10**9)]
+LATE = [*range(1000, 1050)]
 
 
 def chain(state, stamp_ns, items):
@@ -196,12 +200,6 @@ def test_a_looped_recording_restarts_each_time_and_loses_nothing(length, lossy):
     decisions = decide(StampGate(10 * S, 600 * S, 5), *arrivals)
     assert len(restarts(decisions)) == 3
     assert released(decisions) == arrivals.tolist()
-
-
-HUNDRED, NEXT, THOUSAND = [*range(100, 200)], [*range(200, 300)], [*range(1000, 2000)]
-OUTAGE = *HUNDRED, 260, *range(200, 260), *range(261, 300)
-BEYOND = [*range(5 * 10**9 - 50, 5 * 10**9)]
-LATE = [*range(1000, 1050)]
 
 
 def restarts_at(after, arrivals, at, due=None, window=10, gap=600):

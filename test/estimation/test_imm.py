@@ -34,6 +34,9 @@ from sonar_imm.estimation.markov import RateChain
 from sonar_imm.estimation.motion import Joint, Model, Motion, turning, white_acceleration
 
 CASES = 'A2_cv_ct A12_speedstate16_hover A13_ref_only_missed A14_ref_only_EM_N0_1'
+T = np.array([[0.95, 0.05], [0.2, 0.8]])  # asymmetric: a transposed matrix would show
+START = {'mean': [50.0, 10.0, 0.5, 1.0], 'covariance': np.diag([9.0, 9.0, 1.0, 1.0])}
+MODELS = [cv(noise=0.05), ct(noise=0.2, turn_rate=0.15)]
 
 
 class Bank:
@@ -294,11 +297,6 @@ def test_the_gate_is_that_of_single_pairs_and_a_sharp_turn_is_inside():
         known = np.zeros((T, 2, m)), np.zeros((1, 2, m, 1)), np.ones((T, 2, 1, 1))
         seen = np.zeros((D, m)), np.zeros((D, 1, 1))
         assert imm.gate(*known, np.full((T, 2), 0.5), *seen, 9.0).shape == (T, D)
-
-
-T = np.array([[0.95, 0.05], [0.2, 0.8]])  # asymmetric: a transposed matrix would show
-START = {'mean': [50.0, 10.0, 0.5, 1.0], 'covariance': np.diag([9.0, 9.0, 1.0, 1.0])}
-MODELS = [cv(noise=0.05), ct(noise=0.2, turn_rate=0.15)]
 
 
 def walk(steps=60):

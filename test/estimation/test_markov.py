@@ -31,6 +31,8 @@ from sonar_imm.estimation.onset_kernels import FADED, NO_FLOOR
 from sonar_imm.estimation.smoothing import imm_smooth, IMMPredicted, smooth_modes
 
 ASYMMETRIC = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
+PRIOR = np.array([[0.8, 0.15, 0.05], [0.3, 0.5, 0.2], [0.1, 0.2, 0.7]])
+P = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
 
 
 def test_what_is_no_transition_matrix_is_refused():
@@ -117,9 +119,6 @@ def test_persistent_headings_match_the_reference():
     np.testing.assert_allclose(found, known['A4_world16/Pi'], atol=1e-14)
     found = markov.with_hover(markov.persistent_headings(16, 0.88, 2.0), 0.02, 0.9)
     np.testing.assert_allclose(found, known['A12_speedstate16_hover/Pi'], atol=1e-14)
-
-
-PRIOR = np.array([[0.8, 0.15, 0.05], [0.3, 0.5, 0.2], [0.1, 0.2, 0.7]])
 
 
 def test_counting_a_chain_that_is_seen_recovers_it_at_any_step():
@@ -558,9 +557,6 @@ def test_after_a_step_that_no_measurement_explains_the_filtered_states_count():
     end = imm_smooth(*(part[2:] for part in wide), *(part[2:] for part in moves))
     for one, other in zip(whole, end):
         np.testing.assert_allclose(one[2:], other, atol=1e-9)
-
-
-P = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
 
 
 def filtered(likelihood, mu):

@@ -28,6 +28,9 @@ T = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
 TWO = np.array([[0.95, 0.05], [0.3, 0.7]])
 """Asymmetric: a transposed matrix would show."""
 SIGMAS = 4.5
+MODES = ((0.01, 0.0), (0.5, 1.0))
+"""Variance and drift of the two scalar walks."""
+Z = np.array([0.1, -0.3, 0.4, 1.7, 2.2, 2.5, 3.9, 4.0])
 
 
 def still(x, rng, dt):
@@ -113,10 +116,6 @@ def test_one_linear_model_is_the_kalman_filter():
     assert 0.95 * count - 3 * math.sqrt(0.0475 * count) <= inside
 
 
-MODES = ((0.01, 0.0), (0.5, 1.0))
-"""Variance and drift of the two scalar walks."""
-
-
 def tree(transition, z, variance=0.25):
     """Probabilities (2,) of the models, mean and variance after 8 steps, and the log-likelihood:
     one Kalman filter for each of the 512 sequences of models."""
@@ -133,9 +132,6 @@ def tree(transition, z, variance=0.25):
     total, weight = log.max() + math.log(weight.sum()), weight / weight.sum()
     mean = weight @ x
     return [*np.bincount(mode, weight), mean, weight @ (P + (x - mean) ** 2), total]
-
-
-Z = np.array([0.1, -0.3, 0.4, 1.7, 2.2, 2.5, 3.9, 4.0])
 
 
 def particle_run(seed, order):

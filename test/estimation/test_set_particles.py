@@ -28,6 +28,7 @@ ASYMMETRIC = np.array([[0.6, 0.3, 0.1], [0.15, 0.5, 0.35], [0.05, 0.15, 0.8]])
 EXACT_LOG_EVIDENCE = 298.6663117
 """Of the records of exact_hmm.npz, by enumeration of all sets of up to three members on the 60
 cells, in a program of its own."""
+CELLS, SETS = 400, 20_000
 
 
 @pytest.fixture(scope='module')
@@ -284,9 +285,6 @@ def test_of_two_humps_the_greater_is_reported_with_its_own_spread():
     with_modes = find_members(sums, 16, 1, 0.5, modes=True)
     for found, expected in zip(with_modes, find_members(sums, 16, 1, 0.5)):
         assert np.array_equal(found, expected)
-
-
-CELLS, SETS = 400, 20_000
 
 
 @pytest.fixture

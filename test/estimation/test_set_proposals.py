@@ -29,6 +29,7 @@ MODEL = set_model.SetModel(
 )  # fmt: skip
 PLACES = np.array([40, 85, 112, 160, 203, 251, 300, 352])
 SIGMAS = np.array([34.0, 6.0, 28.0, 7.0, 22.0, 9.0, 30.0, 8.0])
+CELLS, JUMP_AT = 11, 3
 
 
 def record(places, sigmas, n=N, seed=None):
@@ -154,9 +155,6 @@ def test_walks_are_drawn_by_what_they_come_to(wide, all_sums):
             assert tables.running[row] == pytest.approx(np.cumsum(q), rel=1e-12)
             ratio = np.divide(K, q, out=np.zeros(5), where=q > 0.0)
             assert tables.ratio[row] == pytest.approx(ratio, rel=1e-12)
-
-
-CELLS, JUMP_AT = 11, 3
 
 
 @pytest.fixture(scope='module')

@@ -34,6 +34,8 @@ T0 = 1_700_000_000 * SECOND
 UTM = np.array([5e5, 4e6, 0.0])
 LATER = 10**9 * SECOND // 4
 """A quarter of 1e9 s: after more, the seconds of a header are over."""
+FIGURES = Figures('metamorphic')
+FEW = {'particles': 2000, 'order_max': 4, 'pulse': 'gaussian', 'pulse_width': 0.18}
 
 
 class Motion:
@@ -251,9 +253,6 @@ def traces(deeper=0.0, late_ns=0, louder=1.0):
     return found
 
 
-FIGURES = Figures('metamorphic')
-
-
 def note(system, how, moved, tolerance, given):
     FIGURES.add({'system': system, 'how': how, 'moved': moved}, tolerance=tolerance, **given)
 
@@ -325,9 +324,6 @@ def reflectors():
     plain = run('fathometer', traces(), **FEW)
     assert all((each.extras['existence'] > 0.5).sum() == 2 for each in plain[1:])
     return plain
-
-
-FEW = {'particles': 2000, 'order_max': 4, 'pulse': 'gaussian', 'pulse_width': 0.18}
 
 
 def test_reflectors_twice_as_loud():

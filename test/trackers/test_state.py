@@ -50,6 +50,14 @@ from sonar_imm_tools.recordings.reader import BagReader
 
 ENDLESS = Path('/proc/self/maps')
 """A regular file whose size, the system says, is 0."""
+CHANGES = [
+    {'version': '9.9.9'}, {'system': 'submarine'}, {'system': ['diver']}, {'parameters': []},
+    {'saved_ns': 'now'}, {'newest_ns': 1.5}, {'extras': ['list']},
+]  # fmt: skip
+QUICK = {'fathometer': {'particles': '200'}}
+SHORT = {'fathometer': ['--set', 'records=8']}
+MOST = 48
+BAG = {'bathymetry': 'ship', 'diver': 'multistatic', 'fathometer': 'pressure', 'obstacle': 'wreck'}
 
 
 @pytest.fixture
@@ -336,12 +344,6 @@ def test_parameters_that_may_change_are_those_of_now(file):
         tracker_from(read_state(file), obstacle, obstacle.config_type()())
 
 
-CHANGES = [
-    {'version': '9.9.9'}, {'system': 'submarine'}, {'system': ['diver']}, {'parameters': []},
-    {'saved_ns': 'now'}, {'newest_ns': 1.5}, {'extras': ['list']},
-]  # fmt: skip
-
-
 def test_the_file_is_named_arrays_and_json(tmp_path):
     run, path = tracked('fathometer_drift'), tmp_path / 'state'
     tracker = run.until(20)
@@ -449,12 +451,6 @@ def test_a_state_that_cannot_be_written_leaves_the_old_one(file, monkeypatch):
         write_state(file, run.saved(run.until(8)))
     assert file.read_bytes() == before
     assert [path.name for path in file.parent.iterdir()] == ['state']
-
-
-QUICK = {'fathometer': {'particles': '200'}}
-SHORT = {'fathometer': ['--set', 'records=8']}
-MOST = 48
-BAG = {'bathymetry': 'ship', 'diver': 'multistatic', 'fathometer': 'pressure', 'obstacle': 'wreck'}
 
 
 def values_of(spec):

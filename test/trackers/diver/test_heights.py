@@ -40,6 +40,15 @@ CV = {'model_set': 'linear', 'association': 'gnn', 'gate_probability': 0.999999}
 ONE = {'dimensions': 3, 'max_tracks': 1}
 Z, W = 2, 5
 """Of z and its rate in the published state."""
+WHOLE, GAP = ([-3.3, -10.0, -16.7], [4.8] * 3), ([-2.0, -2.1, -8.0], [0.2] * 3)
+"""Means and variances that fill the column, and of two depths."""
+PAST = {
+    'receiver_depths': (2.0, 5.0, 8.0, 12.0), 'depth': (1.0, 19.0), 'swell_height': 1.0,
+    'random_rotation': False, 'start': (-40.0, 40.0),
+}  # fmt: skip
+ASKING = np.array([[-40.0, 0.0, 0.0], [40.0, 0.0, 0.0], [10.0, 70.0, 0.0]])
+TURNED = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+"""By an angle between two headings of the models."""
 
 
 def spatial(variance, *across):
@@ -266,10 +275,6 @@ def test_other_copies_stay(means, variance, path_std):
     assert after.rows is state.rows and not after['respreads'].any()
 
 
-WHOLE, GAP = ([-3.3, -10.0, -16.7], [4.8] * 3), ([-2.0, -2.1, -8.0], [0.2] * 3)
-"""Means and variances that fill the column, and of two depths."""
-
-
 @pytest.mark.parametrize('means, variances, weights, two', [
     (*WHOLE, [0.34, 0.33, 0.33], False), (*WHOLE, [0.5, 0.0, 0.5], True),
     (*GAP, [0.4, 0.4, 0.2], True), (*GAP, [0.5, 0.49, 0.01], False),
@@ -278,12 +283,6 @@ WHOLE, GAP = ([-3.3, -10.0, -16.7], [4.8] * 3), ([-2.0, -2.1, -8.0], [0.2] * 3)
 def test_two_depths_are_said_where_there_is_a_gap_between_them(means, variances, weights, two):
     state, tracker = banked(means, variances, weights)
     assert ambiguous_depths(state, tracker.models).tolist() == [two]
-
-
-PAST = {
-    'receiver_depths': (2.0, 5.0, 8.0, 12.0), 'depth': (1.0, 19.0), 'swell_height': 1.0,
-    'random_rotation': False, 'start': (-40.0, 40.0),
-}  # fmt: skip
 
 
 def past_the_transmitter(seed):
@@ -352,11 +351,6 @@ def test_a_track_that_was_somewhere_else_begins_anew_with_all_its_rows():
     mean, covariance = published_state(after, tracker.models, 0.05)
     error = mean[0, :3] - places[ping.stamp_ns][:3]
     assert error @ np.linalg.solve(covariance[0, :3, :3], error) < 12.0
-
-
-ASKING = np.array([[-40.0, 0.0, 0.0], [40.0, 0.0, 0.0], [10.0, 70.0, 0.0]])
-TURNED = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
-"""By an angle between two headings of the models."""
 
 
 def transponders(second, position, rng, count, std=0.5):

@@ -29,6 +29,21 @@ from sonar_imm.trackers.state_file import json_parameters
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
 ORIGIN = Origin(59.0, 10.0)
+FAR = Origin(10.0, 60.0)
+LEVER = {'transceiver_lever': (2.0, 0.0, -1.0), 'transceiver_mount_rpy_deg': (0.0, 0.0, 90.0)}
+EXACT = {
+    'relative_range_std': 0.01, 'relative_angle_std_deg': 0.001,
+    'vessel_heading_std_deg': 0.0, 'vessel_attitude_std_deg': 0.0,
+}  # fmt: skip
+"""Instruments without errors: what errors turn is shorter on average, which is undone."""
+PIER = {**LEVER, 'vessel': 'fixed', 'transceiver_lever': (5.0, 0.0, 0.0)}
+TURNS = {
+    'levelled': ({}, 1.0, True, [30.0, 0.0]),
+    'declination of nav': ({'magnetic_declination_deg': 20.0}, 0.0, False, [30.0, 0.0]),
+    'a pier needs no pose': (PIER, None, False, [5.0, 30.0]),
+}
+AHEAD = (0.0, 0.0, 0.0, 90.0, 0.0, 50.0)
+"""A sonar at the origin that looks along x, 45 degrees to either side, 50 m far."""
 
 
 def geodetic(second, enu, cls=GeodeticFix, origin=ORIGIN, **values):
@@ -128,9 +143,6 @@ def test_an_unknown_height_is_that_of_the_origin():
     assert known == unknown
 
 
-FAR = Origin(10.0, 60.0)
-
-
 def way(count):
     return [geodetic(k + 1, (0.5 * k, 0.0, 0.0)) for k in range(count)]
 
@@ -172,9 +184,6 @@ def test_a_vessel_whose_first_position_is_wrong_places_its_targets():
     there = ORIGIN.geodetic(np.array([2.0 * 28.5 + 20.28, 5.0, 0.0]))
     assert last.extras['latitude'] == pytest.approx([there[0]], abs=1e-5)
     assert last.extras['longitude'] == pytest.approx([there[1]], abs=2e-5)
-
-
-LEVER = {'transceiver_lever': (2.0, 0.0, -1.0), 'transceiver_mount_rpy_deg': (0.0, 0.0, 90.0)}
 
 
 def test_a_relative_fix_is_composed_with_the_pose_between_two_messages():
@@ -281,13 +290,6 @@ def test_a_position_and_a_heading_make_a_pose():
     assert made[-1].frame_id == 'map' and 'latitude' in made[-1].extras
 
 
-EXACT = {
-    'relative_range_std': 0.01, 'relative_angle_std_deg': 0.001,
-    'vessel_heading_std_deg': 0.0, 'vessel_attitude_std_deg': 0.0,
-}  # fmt: skip
-"""Instruments without errors: what errors turn is shorter on average, which is undone."""
-
-
 def placed(config, vessel, offset, yaw=0.0, **values):
     place = dict(zip(('latitude', 'longitude', 'height'), vessel), covariance=1e-4 * np.eye(3))
     items = [relative(1.5, offset, **values)]
@@ -335,14 +337,6 @@ def test_covariances_turn_with_the_axes():
     assert np.diag(found.covariance[0, :2, :2]) == pytest.approx([1.0, 25.0], rel=0.05)
 
 
-PIER = {**LEVER, 'vessel': 'fixed', 'transceiver_lever': (5.0, 0.0, 0.0)}
-TURNS = {
-    'levelled': ({}, 1.0, True, [30.0, 0.0]),
-    'declination of nav': ({'magnetic_declination_deg': 20.0}, 0.0, False, [30.0, 0.0]),
-    'a pier needs no pose': (PIER, None, False, [5.0, 30.0]),
-}
-
-
 @pytest.mark.parametrize('what', TURNS)
 def test_what_does_not_turn_with_the_vessel(what):
     config, yaw, levelled, place = TURNS[what]
@@ -350,10 +344,6 @@ def test_what_does_not_turn_with_the_vessel(what):
     seen = relative(1.5, (30.0, 0.0, 0.0), levelled=levelled)
     (estimate,) = run(DiverTracker(DiverConfig(**config)), [*near, seen])
     assert estimate.state[0, :2] == pytest.approx(place, abs=0.05)
-
-
-AHEAD = (0.0, 0.0, 0.0, 90.0, 0.0, 50.0)
-"""A sonar at the origin that looks along x, 45 degrees to either side, 50 m far."""
 
 
 def written(tmp_path, name, header, rows):

@@ -33,6 +33,13 @@ from sonar_imm.trackers.diver.sensors import of_sensor
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 WARNED = 'fix covariances too small by a factor'
+OF_RADAR = {'sensors': ('radar',), 'own': (('radar.fix_std', 2.0),)}
+SETS = [
+    {'association': 'jipda'}, {'association': 'gnn'},
+    {'model_set': 'heading_speed', 'association': 'gnn', 'gate_probability': 0.9999},
+]  # fmt: skip
+PLACES = np.array([[0.0, 0.0], [40.0, 0.0], [80.0, 0.0]])
+GNN = DiverConfig(**SETS[-1])
 
 
 def swim(seed, count=110, std=1.0, stated=1.0, lasting=0.0):
@@ -199,9 +206,6 @@ def test_a_rejected_fix_weighs_the_scales_by_the_chance_that_it_is_of_the_track(
     assert due[1000.0] > 100.0 * before[pairs.among.scale == 1000.0][0]
 
 
-OF_RADAR = {'sensors': ('radar',), 'own': (('radar.fix_std', 2.0),)}
-
-
 @pytest.mark.parametrize('sensor, values, said', [
     ('', {}, True), ('', {'fix_std': 2.0}, False), ('radar', OF_RADAR, False),
     ('lidar', OF_RADAR, True),
@@ -303,12 +307,6 @@ def test_late_density_is_that_of_the_prototype():
             compared.append(bank.weigh(moved, np.zeros(1, int), v['delay_z'][None], v['R'][None]))
         log = np.log(v['mu']) + np.concatenate([each.log[0] for each in compared])
         assert np.logaddexp.reduce(log) == pytest.approx(due, abs=1e-9)
-
-
-SETS = [
-    {'association': 'jipda'}, {'association': 'gnn'},
-    {'model_set': 'heading_speed', 'association': 'gnn', 'gate_probability': 0.9999},
-]  # fmt: skip
 
 
 def swims(divers, seconds, seed, apart=60.0, false=0.0, detected=0.9, scatter=1.0):
@@ -458,17 +456,11 @@ def test_a_spoilt_covariance_is_repaired_alone(settings):
         assert np.isfinite(ours).all()
 
 
-PLACES = np.array([[0.0, 0.0], [40.0, 0.0], [80.0, 0.0]])
-
-
 def scan(second, places):
     root = np.random.default_rng(second).normal(size=(len(places), 2, 2))
     P = root @ np.swapaxes(root, 1, 2) + 0.2 * np.eye(2)
     places = np.pad(places, [(0, 0), (0, 1)])
     return Fixes(stamp_ns=second * SECOND, position=places, covariance=P)
-
-
-GNN = DiverConfig(**SETS[-1])
 
 
 def predicted(item, config=GNN, places=PLACES):

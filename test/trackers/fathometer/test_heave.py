@@ -26,6 +26,13 @@ from sonar_imm.trackers.fathometer.reflectors import Identified, Identities
 from sonar_imm.trackers.fathometer.response import common_jump
 from sonar_imm.trackers.fathometer.slopes import begun, Common, learned, Slope
 
+ARRAY = 30.0  # m, of the scene
+FEW = {'particles': 2000, 'frequency_min': 100.0, 'frequency_max': 2800.0, 'sound_speed_std': 0.0}
+LAYERS = np.array([52.0, 56.5, 60.0, 64.2, 68.0, 72.5])
+STRENGTH = np.array([25.0, 18.0, 13.0, 10.0, 8.5, 7.0])
+FEWER = {**FEW, 'particles': 1500}
+RECORDS, AT = 24, 14
+
 
 @pytest.fixture(scope='module')
 def heaving():
@@ -106,9 +113,6 @@ def test_a_new_spread_of_the_heave_begins_anew(heaving):
     assert np.isfinite(estimate.extras['heave_std']).all()
 
 
-ARRAY = 30.0  # m, of the scene
-
-
 @pytest.fixture(scope='module')
 def drawn():
     return gaps_scene(0, 0.1, 4)
@@ -158,11 +162,6 @@ def test_heave_and_the_speed_of_the_water_down_to_the_bottom_are_common(drawn):
     bottom = np.broadcast_to(height[:, :1], height.shape)
     due = (height**2 - bottom**2) / 300.0**2
     assert water - own == pytest.approx(due, rel=1e-6, abs=1e-9)
-
-
-FEW = {'particles': 2000, 'frequency_min': 100.0, 'frequency_max': 2800.0, 'sound_speed_std': 0.0}
-LAYERS = np.array([52.0, 56.5, 60.0, 64.2, 68.0, 72.5])
-STRENGTH = np.array([25.0, 18.0, 13.0, 10.0, 8.5, 7.0])
 
 
 def found_of(changes):
@@ -309,10 +308,6 @@ def test_what_all_are_off_by_together():
     ):  # fmt: skip
         assert known.offset(np.array(depths), reach, 0.4) == pytest.approx(due, abs=0.1)
     assert Identities().offset(np.array(seen), 1.5, 0.4) == 0.0
-
-
-FEWER = {**FEW, 'particles': 1500}
-RECORDS, AT = 24, 14
 
 
 def tracked(floor, **options):

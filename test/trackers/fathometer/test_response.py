@@ -30,6 +30,11 @@ from sonar_imm_tools.simulation.fathometer import simulator
 from sonar_imm_tools.simulation.fathometer.scenario import Drift
 
 MIRROR = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
+LAYER, ARRAY = 130.0, 73.5
+SHORT = {
+    'phones': 6, 'frequency_max': 900.0, 'record_seconds': 4.0, 'depth_min': 85.0,
+    'depth_max': 100.0, 'particles': 100,
+}  # fmt: skip
 
 
 def test_the_mirror_lies_at_negative_lags():
@@ -121,9 +126,6 @@ def test_noise_depths_that_a_snapshot_cannot_hold_are_mirrored_and_said():
     assert '75 m below the array with 0.2 s' in said
 
 
-LAYER, ARRAY = 130.0, 73.5
-
-
 @pytest.fixture(scope='module')
 def spectra():
     config = simulator.scenario('small', {'ship_noise': 0.0, 'snapshots': 4000})
@@ -175,12 +177,6 @@ def test_the_pulse_of_an_envelope():
     assert (pulse(np.linspace(-3.0, 3.0, 999)) >= 0.0).all()
     with pytest.raises(ValueError):
         envelope_pulse(10.0, 5.0, 1500.0)
-
-
-SHORT = {
-    'phones': 6, 'frequency_max': 900.0, 'record_seconds': 4.0, 'depth_min': 85.0,
-    'depth_max': 100.0, 'particles': 100,
-}  # fmt: skip
 
 
 def noise(seconds, *, rate=2000.0, phones=6, depths=None, block=0.5, seed=0):

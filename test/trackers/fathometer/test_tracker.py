@@ -27,6 +27,11 @@ from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 RECORD_NS = 90 * 10**9
 SEVEN = {'order_min': 7, 'order_max': 8}
+DEPTH = 50.0 + 1e-4 * np.arange(50_000)
+FINE = Trace(stamp_ns=1, depth=DEPTH, amplitude=np.sin(DEPTH))
+"""50,000 steps of a tenth of a millimetre: 400 kB."""
+LAYERS, STRENGTH = np.array([14.0, 19.5, 27.0]), np.array([1.0, 0.5, 0.3])
+BAND = band_pulse(50.0, 4000.0, 1500.0)
 
 
 @pytest.fixture(scope='module')
@@ -222,11 +227,6 @@ def test_a_pulse_from_a_file(tmp_path):
         assert len(str(raised.value)) < 300
 
 
-DEPTH = 50.0 + 1e-4 * np.arange(50_000)
-FINE = Trace(stamp_ns=1, depth=DEPTH, amplitude=np.sin(DEPTH))
-"""50,000 steps of a tenth of a millimetre: 400 kB."""
-
-
 @pytest.mark.parametrize('parameters', [
     {}, {'depth_std': 100.0, 'depth_step': 1e-3},
     {'depth_step': 1e-9, 'depth_min': 50.0, 'depth_max': 50.0 + 1e-6}, {'depth_step': 1e-300},
@@ -252,9 +252,6 @@ def test_conventional_amplitudes_are_a_third_unless_they_are_remembered():
     conventional = FathometerConfig(processor='conventional')
     assert conventional.amplitude_std == 2.5
     assert evolve(conventional, amplitude_memory=0.9).amplitude_std == 7.5
-
-
-LAYERS, STRENGTH = np.array([14.0, 19.5, 27.0]), np.array([1.0, 0.5, 0.3])
 
 
 def made(width, records=12, noise=0.05, seed=5):
@@ -294,9 +291,6 @@ def test_pulse_of_the_band_is_left_alone(vectors):
     # What is told is used, and echoes narrower than the samples say nothing.
     assert not EchoWidth().take(next(made(0.5)), FathometerConfig(pulse='band'), BAND)
     assert not EchoWidth().take(next(made(0.03)), config, BAND)
-
-
-BAND = band_pulse(50.0, 4000.0, 1500.0)
 
 
 def test_pulse_is_judged_anew_until_many_traces_have_shown_it():

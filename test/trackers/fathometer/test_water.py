@@ -28,6 +28,7 @@ LINES = {
     'flat': {}, 'silent water': {'noise': 0.002, 'threshold': 0.02}, 'scatter': {'scatter': 0.3},
     'transmit pulse': {'ring': 1.5}, 'waves': {'waves': 2.5},
 }  # fmt: skip
+CUT = {'pulse': 'gaussian', 'noise_sigma': 0.05, 'min_separation': 1.5, 'depth_std': 0.1}
 
 
 def line(
@@ -252,9 +253,6 @@ def cut_line(first, top=12.0):
         echo += np.exp(-0.5 * np.square((depth[:, None] - [top, lower]) / 0.5)).sum(axis=1)
         seen = depth >= first
         yield Trace(stamp_ns=(k + 1) * 10**9, depth=depth[seen], amplitude=echo[seen])
-
-
-CUT = {'pulse': 'gaussian', 'noise_sigma': 0.05, 'min_separation': 1.5, 'depth_std': 0.1}
 
 
 def test_below_a_floor_that_the_window_cuts_nothing_is_the_floor():
