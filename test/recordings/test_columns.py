@@ -59,9 +59,8 @@ def test_headers_in_six_languages(table):
     assert (made.index['latitude'], made.index['longitude']) == (3, 4)
 
 
-@pytest.mark.parametrize(
-    'name, header, cell, value',
-    [
+def test_units_of_headers_are_heeded(table):
+    for name, header, cell, value in (
         ('x', 'East (km)', 1.5, 1500.0), ('x', 'x_cm', 150, 1.5),
         ('depth', 'Depth (ft)', 10, 3.048), ('depth', 'depth_ft', 10, 3.048),
         ('depth', 'Depth (below surface)', 10, 10), ('depth', 'Tiefe [m]', 10, 10),
@@ -73,11 +72,9 @@ def test_headers_in_six_languages(table):
         ('bearing', 'bearing_deg', 180, 3.14159265), ('bearing', 'Peilung [°]', 180, 3.14159265),
         ('x', 'Est (pieds)', 10, 3.048), ('x', 'East [yd]', 100, 91.44),
         ('y', 'X (North)', 3, 3), ('x', 'Y (Rechtswert)', 3, 3),
-    ],
-)  # fmt: skip
-def test_units_of_headers_are_heeded(table, name, header, cell, value):
-    (row,) = table(f'{header};time\n{cell};1\n')
-    assert row.number(name) == pytest.approx(value, rel=1e-5)
+    ):  # fmt: skip
+        (row,) = table(f'{header};time\n{cell};1\n')
+        assert row.number(name) == pytest.approx(value, rel=1e-5), header
 
 
 def test_a_unit_of_another_kind_is_refused(table):
@@ -209,22 +206,19 @@ def test_words_for_bad_rows(table):
                 row.require_valid()
 
 
-@pytest.mark.parametrize(
-    'header, cells, named',
-    [('Kurs [°]', '{c}', 'Kurs'), ('heading', '{c}', 'heading'), ('SNR [dB];no', '{c};{k}', ''),
-     ('Rumbo buque', '{k}', 'Rumbo buque'), ('ship speed', '3', 'ship speed'),
-     ('pos1;pos2', '59.4{c};10.4{c}', 'pos1, pos2'), ('note;port', 'a{k};7', '')],
-)  # fmt: skip
-def test_columns_that_may_be_the_vessel_are_a_question(convert, header, cells, named):
-    rows = [f'{k};50;{k}0;' + cells.format(k=k, c=k * k + 3) for k in range(1, 9)]
-    text = '\n'.join([f'time;range;bearing_deg;{header}', *rows]) + '\n'
-    if named:
-        with pytest.raises(BagError) as caught:
-            convert(text)
-        assert named in caught.value.sentence and '--bearings north' in caught.value.sentence
-        convert(text, bearings='north')
-    else:
-        assert convert(text).messages == {'/fix': 8}
+def test_columns_that_may_be_the_vessel_are_a_question(convert):
+    for header, cells, named in (
+        ('Kurs [°]', '{c}', 'Kurs'), ('heading', '{c}', 'heading'), ('SNR [dB];no', '{c};{k}', ''),
+        ('Rumbo buque', '{k}', 'Rumbo buque'), ('ship speed', '3', 'ship speed'),
+        ('pos1;pos2', '59.4{c};10.4{c}', 'pos1, pos2'), ('note;port', 'a{k};7', ''),
+    ):  # fmt: skip
+        rows = [f'{k};50;{k}0;' + cells.format(k=k, c=k * k + 3) for k in range(1, 9)]
+        text = '\n'.join([f'time;range;bearing_deg;{header}', *rows]) + '\n'
+        if named:
+            with pytest.raises(BagError, match=f'{re.escape(named)}.*--bearings north'):
+                convert(text)
+        how = {'bearings': 'north'} if named else {}
+        assert convert(text, out=header, **how).messages == {'/fix': 8}
 
 
 def test_the_heading_of_a_vessel_is_asked_for_by_the_columns_that_are_left(convert, tmp_path):
