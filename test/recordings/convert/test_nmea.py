@@ -225,11 +225,10 @@ def test_the_date_is_advised_only_where_it_helps(tmp_path):
 def by_talkers(apart, first='GP'):
     """A log of two talkers, of which GN says more, `apart` m to the north."""
     lines, there = [], (PLACE[0] + apart / 111e3, PLACE[1])
-    for k in range(20):
-        moment = BEGIN + timedelta(seconds=k)
+    for moment in (BEGIN + timedelta(seconds=k) for k in range(20)):
         more = [position(kind, moment, there, 'GN') for kind in ('RMC', 'GGA')]
-        both = [[position('GGA', moment)], more]
-        lines += sum(both if first == 'GP' else both[::-1], [])
+        one = [position('GGA', moment)]
+        lines += one + more if first == 'GP' else more + one
     return lines
 
 
