@@ -17,8 +17,7 @@ import shutil
 from types import SimpleNamespace
 
 from attrs import evolve
-from helpers.dive_bags import write_dive
-from helpers.dive_scenes import single_run
+from helpers.dive_scenes import single_run, write_dive
 import numpy as np
 import pytest
 

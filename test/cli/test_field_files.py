@@ -14,11 +14,10 @@ from pathlib import Path
 import re
 import shutil
 
-from helpers.commands import run
+from helpers.commands import figures, run, unpacked
 from helpers.estimates import same
 from helpers.field_files import BAGS, FORMATS, line
 from helpers.obstacle_runs import tracked_by_command
-from helpers.report_pages import figures, unpacked
 from helpers.source import ROOT
 import numpy as np
 import pytest

@@ -18,7 +18,7 @@ import shutil
 from attrs import evolve
 from helpers import marine
 from helpers.commands import contents
-from helpers.dive_bags import write_dive
+from helpers.dive_scenes import write_dive
 from helpers.field_files import bag_of, FORMATS, line, measured
 from helpers.source import ROOT
 import numpy as np

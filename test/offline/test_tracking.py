@@ -17,8 +17,7 @@ import sys
 import time
 
 from helpers.clusters import dying as work
-from helpers.dive_bags import write_dive
-from helpers.dive_scenes import estimate_at, SECOND, START_NS
+from helpers.dive_scenes import estimate_at, SECOND, START_NS, write_dive
 from helpers.estimates import same
 from helpers.source import ROOT
 import numpy as np

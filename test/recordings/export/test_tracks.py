@@ -16,7 +16,7 @@ import struct
 from xml.etree import ElementTree
 
 from helpers.commands import run as command
-from helpers.dive_bags import write_dive
+from helpers.dive_scenes import write_dive
 from helpers.sonar_files import write_segy
 import numpy as np
 import pymap3d
