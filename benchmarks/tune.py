@@ -22,8 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.recordings import DATA
-from benchmarks.study import Parts, study
+from benchmarks.study import DATA, Parts, study
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.tracker import DiverConfig
 from sonar_imm_tools.cli import main as sonar_imm

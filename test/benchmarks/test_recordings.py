@@ -11,7 +11,8 @@
 import numpy as np
 import pytest
 
-from benchmarks.recordings import autoferry, DATA, scans_of, truth_of
+from benchmarks.recordings import autoferry, scans_of, truth_of
+from benchmarks.study import DATA
 
 
 def record(time, measurement, sensor=2):

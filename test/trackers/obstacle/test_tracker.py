@@ -29,7 +29,7 @@ from numpy.testing import assert_allclose
 import pytest
 from scipy.stats import norm
 
-from benchmarks.real_navigation import data_folder, dead_reckoned, summary
+from benchmarks.real_navigation import dead_reckoned, FOLDER, summary
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.parameters import ConfigError
@@ -270,11 +270,11 @@ def test_the_edges_of_the_beam_are_smeared():
 
 @pytest.mark.statistics
 @pytest.mark.skipif(
-    not (data_folder() / 'dvl.csv').exists(),
+    not (FOLDER / 'dvl.csv').exists(),
     reason='the recorded navigation is not there (SONAR_IMM_DATA)',
 )
 def test_the_band_holds_the_offset_under_real_motion():
-    found = summary(dead_reckoned(data_folder()), runs=20)
+    found = summary(dead_reckoned(), runs=20)
     assert found['tracked'] == 20
     assert found['band_coverage'] >= 0.8
     assert found['nees'] < 2.0
