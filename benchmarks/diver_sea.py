@@ -16,11 +16,11 @@ the horizontal position (2 is due), for depth also of all three coordinates (3 i
 
 `receivers`: raw arrivals; one diver swims legs of 7 to 15 s at .75 m/s for 100 s, a ping a second,
 ranges of .5 m. `two receivers` 80 m apart, `third from ping 40`, scored before and after it; one
-range a ping: `buoys`, four at the corners of 80 m in turn; `ship on a circle` of 50 m at 5 m/s, of the
-diver and of a transponder that stands; `ship on a line`; `one receiver`. `inside` is the share in
-the 95 % ellipse; `sure and wrong` the share of runs of which a fifth of the estimates have a NEES
-above 50; `begins s` is the median of the first confirmed estimate; `tracked` of the runs have one.
-Side A and side B are in the estimate, so its RMSE is half their distance.
+range a ping: `buoys`, four at the corners of 80 m in turn; `ship on a circle` of 50 m at 5 m/s, of
+the diver and of a transponder that stands; `ship on a line`; `one receiver`. `inside` is the share
+in the 95 % ellipse; `sure and wrong` the share of runs of which a fifth of the estimates have a
+NEES above 50; `begins s` is the median of the first confirmed estimate; `tracked` of the runs have
+one. Side A and side B are in the estimate, so its RMSE is half their distance.
 
 `few`: of eight receivers about, so many hear a ping (2 % wild, .3 m of path); `echo` has a
 transmitter, `tag` none, in steps of 1 s and of 29 s, in which a diver turns several times. `ratio`

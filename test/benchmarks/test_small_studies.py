@@ -18,18 +18,18 @@ from benchmarks import study
 SMALL = {
     'bathymetry_paper': ({'pings': 1, 'parts': ['methods']}, {}, 'methods>defaults>patch'),
     'bathymetry_sea': ({'pings': 2, 'only': 'nadir'}, {}, 'cases>nadir, terrain>rmse_m'),
-    'bathymetry_surfaces': (
-        {'pings': 1},
+    'bathymetry_accuracy': (
+        {'object_pings': 1, 'parts': ['resolved']},
         {'SIZES': {'ledge': (2.0, 3.0)}, 'BANDS': ((17.0, 77.0),)}
-        | {'SETTINGS': {'8 staves': {}}, 'FLOORS': {'flat': ('thermal', {'patch_std': 0.0})}},
+        | {'SETTINGS': {'8 staves': {}}, 'BARE': {'flat': ('thermal', {'patch_std': 0.0})}},
         'resolved>ledge, 8 staves>rmse_m',
     ),
-    'fathometer_gaps': (
-        {'runs': 1, 'particles': 200, 'drawn': 2, 'cases': ['30 missing, walk 0.1 m']},
+    'fathometer_sea': (
+        {'runs': 1, 'particles': 200, 'drawn': 2, 'parts': ['30 missing, walk 0.1 m']},
         {},
-        'table>30 missing, walk 0.1 m, Kalman>inside',
+        'gaps>30 missing, walk 0.1 m, Kalman>inside',
     ),
-    'obstacle_accuracy': ({'runs': 5, 'cases': ['images']}, {}, 'images>found>steady>21 dB'),
+    'obstacle_accuracy': ({'pictures': 5, 'parts': ['images']}, {}, 'images>found>steady>21 dB'),
 }
 """Options, what is made smaller besides, and a number."""
 

@@ -13,7 +13,7 @@ from helpers.fathometer_runs import run
 import numpy as np
 import pytest
 
-from benchmarks.fathometer_gaps import (
+from benchmarks.fathometer_sea import (
     BEFORE,
     DIPPING,
     dipping,

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from benchmarks.fathometer_gaps import scene as gaps_scene
+from benchmarks.fathometer_sea import scene as gaps_scene
 from sonar_imm.measurements import Rejection, Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.datum import (
