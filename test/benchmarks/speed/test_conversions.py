@@ -11,7 +11,7 @@
 import numpy as np
 import pytest
 
-from benchmarks import conversions
+from benchmarks.speed import conversions
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
