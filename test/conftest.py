@@ -30,9 +30,7 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
 os.environ.pop('ROS_LOCALHOST_ONLY', None)
 
 # Without ROS the rest of the package is still tested, e.g. on the oldest numpy.
-without_ros = ['nodes', 'replay', 'system']
-collect_ignore = [] if importlib.util.find_spec('rclpy') else without_ros
-
+collect_ignore = [] if importlib.util.find_spec('rclpy') else ['nodes', 'replay', 'system']
 
 SHARES = 8
 """Of the statistical tests `make test` runs every so many-th, another share after each commit."""

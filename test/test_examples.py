@@ -34,10 +34,6 @@ if not EXAMPLES:
     pytest.skip('these tests read the source tree', allow_module_level=True)
 
 
-def test_there_is_one_for_each_system():
-    assert [path.stem for path in EXAMPLES] == sorted(SYSTEMS)
-
-
 @pytest.mark.parametrize('path', EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs_without_ros_and_writes_a_plot(path, tmp_path):
     done = subprocess.run(
@@ -47,21 +43,11 @@ def test_an_example_runs_without_ros_and_writes_a_plot(path, tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.count('\n') == 1 and any(letter.isdigit() for letter in done.stdout)
+    text = path.read_text(encoding='utf-8')
+    begin = ast.parse(text).body[1].lineno  # after its docstring
+    assert sum(bool(line.strip()) for line in text.splitlines()[begin - 1 :]) <= MOST_LINES
     page = (tmp_path / f'{path.stem}.html').read_text(encoding='utf-8')
     assert page.count('"type":"scatter"') >= 2 and 'Plotly.newPlot' in page
-
-
-@pytest.mark.parametrize('path', EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_is_short(path):
-    text = path.read_text(encoding='utf-8')
-    (_, *code) = ast.parse(text).body
-    lines = text.splitlines()[code[0].lineno - 1 :]
-    assert sum(bool(line.strip()) for line in lines) <= MOST_LINES
-
-
-def cells(path, kind):
-    book = json.loads(path.read_text(encoding='utf-8'))
-    return [''.join(cell['source']) for cell in book['cells'] if cell['cell_type'] == kind]
 
 
 @pytest.mark.parametrize('path', NOTEBOOKS, ids=lambda path: path.stem)
@@ -70,16 +56,16 @@ def test_a_notebook_runs_and_the_site_shows_what_it_gives(path, monkeypatch):
     import site_pages
 
     page = site_pages.notebook(path)  # runs every cell; they have assertions
-    code = cells(path, 'code')
+    cells = json.loads(path.read_text(encoding='utf-8'))['cells']
+    code = [''.join(cell['source']) for cell in cells if cell['cell_type'] == 'code']
     assert page.startswith('# ') and page.count('```python') == len(code) >= 3
     assert page.count('```text') >= 2
     assert ('Plotly.newPlot' in page) == ('plotly' in ''.join(code))
-    book = json.loads(path.read_text(encoding='utf-8'))
-    assert not any(cell.get('outputs') for cell in book['cells'])
+    assert not any(cell.get('outputs') for cell in cells)
 
 
-def test_the_page_of_own_models_holds():
-    """Its classes satisfy the contracts."""
+def test_there_is_one_for_each_system_and_the_page_of_own_models_holds():
+    assert [path.stem for path in EXAMPLES] == sorted(SYSTEMS)
     page = (ROOT / 'docs' / 'howto' / 'own_model.md').read_text(encoding='utf-8')
     space = {}
     for block in re.findall(r'```python\n(.*?)```', page, re.DOTALL):

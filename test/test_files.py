@@ -95,8 +95,6 @@ def test_file_systems_without_locks_keep_leftovers(tmp_path, monkeypatch):
     def no_locks(*_):
         raise OSError(38, 'no locks')
 
-    shutil.rmtree(tmp_path)
-    os.mkdir(tmp_path)
     (tmp_path / f'out{UNFINISHED}abc').mkdir()
     monkeypatch.setattr(fcntl, 'flock', no_locks)
     with whole(tmp_path / 'out') as path:
@@ -200,15 +198,11 @@ def touch(path):
     return path
 
 
-@pytest.mark.parametrize(
-    'place',
-    [
-        'lib/python3.12/site-packages',  # pip in a venv, colcon
-        'lib/python3.12/dist-packages',  # Debian's Python
-        'local/lib/python3.12/dist-packages',  # the same, colcon on Ubuntu
-        '.',  # pip install --target
-    ],
-)
+SITE, DEBIAN = 'lib/python3.12/site-packages', 'lib/python3.12/dist-packages'
+
+
+# pip in a venv and colcon; Debian's Python; colcon on Ubuntu; pip install --target
+@pytest.mark.parametrize('place', [SITE, DEBIAN, f'local/{DEBIAN}', '.'])
 def test_installed_files_lie_in_share_of_the_prefix(tmp_path, place):
     module = touch(tmp_path / place / 'sonar_imm' / 'resources.py')
     touch(tmp_path / 'share' / 'sonar_imm' / 'package.xml')
@@ -235,16 +229,10 @@ def test_links_of_a_symlink_install_lead_to_the_source(tmp_path):
     assert share_folder(link / 'resources.py') == tmp_path / 'src'
 
 
-def test_a_copied_module_says_what_is_missing(tmp_path):
+def test_a_shared_file_is_found_and_what_is_missing_is_named(tmp_path):
     module = touch(tmp_path / 'sonar_imm' / 'resources.py')
     with pytest.raises(FileNotFoundError, match='install the package with pip or colcon'):
         share_folder(module)
-
-
-def test_the_default_parameters_are_shared():
     assert 'ros__parameters' in shared_file('config/diver.yaml').read_text(encoding='utf-8')
-
-
-def test_an_unknown_shared_file_is_named():
     with pytest.raises(FileNotFoundError, match="no shared file 'bags/nothing'"):
         shared_file('bags/nothing')

@@ -51,23 +51,17 @@ def test_every_key_is_of_a_kind_that_is_asked():
     assert kinds == {'command', 'kind', 'parameter', 'choice', 'executable', 'option'}
 
 
-@pytest.mark.parametrize('name', of_kind('command'))
-def test_commands(capsys, name):
-    assert name not in COMMANDS
-    assert f"'{name}' {GONE[f'command {name}']}" in answer(capsys, name, 'a', 'b')
-
-
-@pytest.mark.parametrize('name', of_kind('kind'))
-def test_kinds_of_conversion(capsys, name):
-    assert name not in OPTIONS
-    assert f"'{name}' {GONE[f'kind {name}']}" in answer(capsys, 'convert', name, 'a', 'b')
-
-
-@pytest.mark.parametrize('name', of_kind('option'))
-def test_options(capsys, name):
-    command, option = name.split()
-    said = answer(capsys, command, 'out', f'{option}=1')
-    assert f"'{option}' {GONE[f'option {name}']}" in said
+def test_commands_kinds_of_conversion_and_options(capsys):
+    for name in of_kind('command'):
+        assert name not in COMMANDS
+        assert f"'{name}' {GONE[f'command {name}']}" in answer(capsys, name, 'a', 'b')
+    for name in of_kind('kind'):
+        assert name not in OPTIONS
+        assert f"'{name}' {GONE[f'kind {name}']}" in answer(capsys, 'convert', name, 'a', 'b')
+    for name in of_kind('option'):
+        command, option = name.split()
+        said = answer(capsys, command, 'out', f'{option}=1')
+        assert f"'{option}' {GONE[f'option {name}']}" in said
 
 
 def test_parameters():
@@ -100,19 +94,16 @@ def test_a_recording_may_still_have_them(capsys, tmp_path, line):
     assert 'was removed' in answer(capsys, 'track', bag, tmp_path / 'out')
 
 
-@pytest.mark.parametrize('name', of_kind('choice'))
-def test_choices(name):
-    parameter, value = name.split()
-    with pytest.raises(ConfigError) as caught:
-        SYSTEMS['diver'].config_type().from_mapping({parameter: value})
-    assert f"parameter '{parameter}': '{value}' {GONE[f'choice {name}']}" in str(caught.value)
-
-
-@pytest.mark.parametrize('name', of_kind('executable'))
-def test_programs(capsys, monkeypatch, name):
-    monkeypatch.setattr(sys, 'argv', [f'/opt/lib/sonar_imm/{name}'])
-    assert commands.main() == 2
-    assert capsys.readouterr().err == f'{name} {GONE[f"executable {name}"]}\n'
+def test_choices_and_programs(capsys, monkeypatch):
+    for name in of_kind('choice'):
+        parameter, value = name.split()
+        with pytest.raises(ConfigError) as caught:
+            SYSTEMS['diver'].config_type().from_mapping({parameter: value})
+        assert f"parameter '{parameter}': '{value}' {GONE[f'choice {name}']}" in str(caught.value)
+    for name in of_kind('executable'):
+        monkeypatch.setattr(sys, 'argv', [f'/opt/lib/sonar_imm/{name}'])
+        assert commands.main() == 2
+        assert capsys.readouterr().err == f'{name} {GONE[f"executable {name}"]}\n'
 
 
 def test_what_a_sentence_names_is_there():

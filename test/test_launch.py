@@ -51,15 +51,11 @@ def test_each_node_has_a_launch_file_that_starts_its_executable(system):
     assert include.get('file') == f'{SHARE}launch/node.launch.xml'
     assert given == {'system': system}
     (node,) = tree('node').findall('node')
-    assert node.get('exec').replace('$(var system)', system) in executables()
+    installed = {f'{system}_node' for system in SYSTEMS}
+    installed.update(re.findall(r"'(\w+_node) = ", (ROOT / 'setup.py').read_text()))
+    assert node.get('exec').replace('$(var system)', system) in installed
     # The name is what the parameter files and the remaps of the documentation use.
     assert node.get('name') == '$(var system)'
-
-
-def executables():
-    """What setup.py installs for `ros2 run`."""
-    names = {f'{system}_node' for system in SYSTEMS}
-    return names | set(re.findall(r"'(\w+_node) = ", (ROOT / 'setup.py').read_text()))
 
 
 def test_the_file_for_all_starts_every_system_once_in_a_namespace_of_its_own():
@@ -134,9 +130,13 @@ def test_the_costmap_of_the_tutorial_takes_what_is_sent():
     source = layer[layer['observation_sources']]
     assert source['data_type'] == 'PointCloud2' and source['topic'] == '/avoid/points'
     place = {name: np.array([value], 'f4') for name, value in zip('xyz', (3.0, 4.0, -20.0))}
+    tracker = ObstacleTracker(ObstacleConfig())
+    scene = simulate(scenario('approach', {'last_range': 60.0}), 1)
+    *_, last = (each for item in scene.measurements for each in tracker.process(item.measurement))
+    assert len(last)
     clouds = [
         encode_table(place, stamp_ns=1, frame_id='odom', make=ros_message),
-        write_estimate(one_estimate(), ros_message),
+        write_estimate(last, ros_message),
     ]
     for cloud in clouds:
         fields = {field.name: field for field in cloud.fields}
@@ -145,14 +145,3 @@ def test_the_costmap_of_the_tutorial_takes_what_is_sent():
         assert source['min_obstacle_height'] < z < source['max_obstacle_height']
         assert cloud.header.frame_id == settings['global_frame']
     assert settings['plugins'] == ['obstacle_layer', 'inflation_layer']
-
-
-def one_estimate():
-    """The last estimate of a short approach."""
-    tracker = ObstacleTracker(ObstacleConfig())
-    scene = simulate(scenario('approach', {'last_range': 60.0}), 1)
-    found = [
-        estimate for item in scene.measurements for estimate in tracker.process(item.measurement)
-    ]
-    assert len(found[-1])
-    return found[-1]

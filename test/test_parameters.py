@@ -17,19 +17,8 @@ from hypothesis import strategies as st
 import pytest
 import yaml
 
-from sonar_imm.parameters import (
-    Config,
-    ConfigError,
-    constant,
-    did_you_mean,
-    inherited,
-    KINDS,
-    live,
-    markdown_table,
-    parameter,
-    parameters_from_yaml,
-    ParameterSpec,
-)
+from sonar_imm import parameters
+from sonar_imm.parameters import Config, ConfigError, live, parameter, parameters_from_yaml
 from sonar_imm.trackers import SYSTEMS
 
 
@@ -56,6 +45,8 @@ def problems(**values):
 
 # -- one value ------------------------------------------------------------------------------------
 
+GAIT = "parameter 'gait' must be one of walk, march, crawl"
+
 
 @pytest.mark.parametrize(
     'values, sentence',
@@ -65,27 +56,18 @@ def problems(**values):
         ({'steps': 0}, "parameter 'steps' must be at least 1, got 0"),
         ({'stops': [5, 100]}, "parameter 'stops' must be at most 99, got 100"),
         ({'weights': [0.5, 1.5]}, "parameter 'weights' must be between 0 and 1, got 1.5"),
-        ({'speed': 'fast'}, "parameter 'speed' must be a number, got 'fast'"),
         ({'speed': '1.0'}, "parameter 'speed' must be a number, got '1.0'"),
         ({'speed': None}, "parameter 'speed' must be a number, got None"),
         ({'speed': True}, "parameter 'speed' must be a number, got True"),
-        ({'speed': [1.0]}, "parameter 'speed' must be a number, got [1.0]"),
         ({'steps': True}, "parameter 'steps' must be a whole number, got True"),
         ({'steps': 2.0}, "parameter 'steps' must be a whole number, got 2.0"),
         ({'calm': 1}, "parameter 'calm' must be true or false, got 1"),
-        ({'calm': 'yes'}, "parameter 'calm' must be true or false, got 'yes'"),
         ({'name': 7}, "parameter 'name' must be text, got 7"),
-        ({'gait': 'run'}, "parameter 'gait' must be one of walk, march, crawl, got 'run'"),
-        (
-            {'gait': 'mach'},
-            "parameter 'gait' must be one of walk, march, crawl, got 'mach' "
-            "(did you mean 'march'?)",
-        ),
+        ({'gait': 'run'}, f"{GAIT}, got 'run'"),
+        ({'gait': 'mach'}, f"{GAIT}, got 'mach' (did you mean 'march'?)"),
         ({'weights': 0.5}, "parameter 'weights' must be a list of float, got 0.5"),
-        ({'weights': '0.5'}, "parameter 'weights' must be a list of float, got '0.5'"),
         ({'weights': [0.5, 'x']}, "parameter 'weights' must be a number, got 'x'"),
         ({'weights': [[0.5]]}, "parameter 'weights' must be a number, got [0.5]"),
-        ({'weights': [True]}, "parameter 'weights' must be a number, got True"),
         ({'stops': [1, 2.5]}, "parameter 'stops' must be a whole number, got 2.5"),
         ({'stops': [False]}, "parameter 'stops' must be a whole number, got False"),
         ({'roads': ['a', 1]}, "parameter 'roads' must be text, got 1"),
@@ -115,17 +97,10 @@ def test_the_ends_of_a_range_belong_to_it():
 def test_values_become_what_the_kind_says():
     walker = Walker(speed=1, weights=[1, 0], stops=[3], roads=['x'])
     assert walker == Walker(speed=1.0, weights=(1.0, 0.0), stops=(3,), roads=('x',))
-    assert type(walker.speed) is float and [type(weight) for weight in walker.weights] == [
-        float,
-        float,
-    ]
-    assert (walker.weights, walker.stops, walker.roads) == ((1.0, 0.0), (3,), ('x',))
+    assert {type(each) for each in (walker.speed, *walker.weights)} == {float}
     assert hash(walker) == hash(Walker(speed=1.0, weights=(1, 0), stops=(3,), roads=('x',)))
     assert type(Walker(steps=2).steps) is int
-
-
-def test_a_list_may_be_empty():
-    assert Walker(weights=[], stops=(), roads=[]).weights == ()
+    assert Walker(weights=[], stops=(), roads=[]).weights == ()  # a list may be empty
 
 
 # -- several values -------------------------------------------------------------------------------
@@ -139,9 +114,7 @@ def test_every_mistake_is_told_at_once():
         "parameter 'speed' must be between 0 and 3, got 9.0 m/s",
         "parameter 'steps' must be at least 1, got 0",
     )
-    with pytest.raises(ConfigError) as caught:
-        Walker.from_mapping({'sped': 1.0, 'steps': 0})
-    assert str(caught.value) == '; '.join(caught.value.problems)
+    assert str(ConfigError(*given)) == '; '.join(given)
 
 
 def test_unknown_names_may_be_passed_over_but_not_bad_values():
@@ -152,35 +125,25 @@ def test_unknown_names_may_be_passed_over_but_not_bad_values():
 
 def test_rules_across_parameters_come_after_those_of_each():
     assert problems(speed=2.0) == ('speed must exceed steps',)
-    assert problems(speed=2.0, gait='run') == (
-        "parameter 'gait' must be one of walk, march, crawl, got 'run'",
-    )
+    assert problems(speed=2.0, gait='run') == (f"{GAIT}, got 'run'",)
     with pytest.raises(ConfigError, match='must exceed'):
         attrs.evolve(Walker(speed=2.0, steps=2), steps=3)
     assert Walker(speed=2.0, steps=2).steps == 2
 
 
-def test_an_empty_mapping_gives_the_defaults():
-    assert Walker.from_mapping({}) == Walker()
-
-
 def test_a_config_cannot_be_changed():
     with pytest.raises(attrs.exceptions.FrozenInstanceError):
-        Walker().speed = 1.0
+        Walker.from_mapping({}).speed = 1.0
 
 
 @pytest.mark.parametrize('system', SYSTEMS)
 @given(
     values=st.dictionaries(
         st.one_of(st.text(max_size=5), st.sampled_from(['seed', 'history', 'gate', 'method'])),
-        st.one_of(
-            st.none(),
-            st.booleans(),
-            st.integers(),
-            st.floats(),
-            st.text(max_size=5),
-            st.lists(st.one_of(st.integers(), st.floats(), st.text(max_size=2)), max_size=3),
-            st.dictionaries(st.text(max_size=2), st.integers(), max_size=2),
+        st.recursive(
+            st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+            lambda each: st.lists(each, max_size=3) | st.dictionaries(st.text(), each, max_size=2),
+            max_leaves=3,
         ),
         max_size=4,
     )
@@ -215,7 +178,7 @@ def test_specs_say_what_was_declared():
         'speed', 'steps', 'calm', 'gait', 'name', 'weights', 'stops', 'roads',
     ]  # fmt: skip
     kinds = ['float', 'int', 'bool', 'str', 'str', 'float[]', 'int[]', 'str[]']
-    assert [spec.kind for spec in specs.values()] == kinds and set(kinds) <= set(KINDS)
+    assert [spec.kind for spec in specs.values()] == kinds and set(kinds) <= set(parameters.KINDS)
     speed = specs['speed']
     assert (speed.default, speed.unit, speed.low, speed.high) == (0.5, 'm/s', 0.0, 3.0)
     assert not speed.read_only and specs['steps'].read_only
@@ -234,8 +197,8 @@ def test_a_derived_class_keeps_the_parameters_of_its_base():
 
 @attrs.frozen(kw_only=True)
 class Sleeper(Walker):
-    rest: float = constant(8.0, 'h', 'how long he sleeps', range=(0.0, 24.0))
-    steps: int = inherited(Walker, 'steps', 1, constant=True)
+    rest: float = parameters.constant(8.0, 'h', 'how long he sleeps', range=(0.0, 24.0))
+    steps: int = parameters.inherited(Walker, 'steps', 1, constant=True)
 
 
 def test_a_constant_is_checked_but_no_parameter():
@@ -253,33 +216,27 @@ def test_a_constant_is_checked_but_no_parameter():
         sleeper.require_changeable(Sleeper(steps=2))
 
 
-def test_plain_values_come_back():
+def test_plain_values_come_back_and_an_empty_list_needs_its_kind():
+    with pytest.raises(TypeError, match='kind='):
+        parameter((), '', 'which')
     values = Walker(stops=(1, 2)).as_dict()
     assert values['stops'] == [1, 2] and values['weights'] == [0.25, 0.75]
     assert list(values) == [spec.name for spec in Walker.specs()]
     assert Walker.from_mapping(values) == Walker(stops=(1, 2))
 
 
-def test_an_empty_list_needs_its_kind():
-    with pytest.raises(TypeError, match='kind='):
-        parameter((), '', 'which')
-
-
-@pytest.mark.parametrize(
-    'limits, words',
-    [
-        ({}, ''),
-        ({'low': 0.0}, 'at least 0'),
-        ({'high': 1e6}, 'at most 1e+06'),
-        ({'low': -1.5, 'high': 2}, 'between -1.5 and 2'),
-    ],
-)
-def test_ranges_in_words(limits, words):
-    assert ParameterSpec('x', 'float', 0.0, 'what', **limits).range_text() == words
+def test_ranges_in_words():
+    for limits, words in (
+        ((None, None), ''), ((0.0, None), 'at least 0'), ((None, 1e6), 'at most 1e+06'),
+        ((-1.5, 2), 'between -1.5 and 2'),
+    ):  # fmt: skip
+        given = dict(zip(('low', 'high'), limits))
+        spec = parameters.ParameterSpec('x', 'float', 0.0, 'what', **given)
+        assert spec.range_text() == words
 
 
 def test_the_table_has_one_row_per_parameter():
-    rows = markdown_table(Walker.specs()).splitlines()
+    rows = parameters.markdown_table(Walker.specs()).splitlines()
     assert len(rows) == 2 + len(Walker.specs())
     assert rows[2] == r'| `speed`\* | `0.5` m/s | how fast |'
     assert rows[5] == '| `gait` | `"walk"`; `walk`, `march`, `crawl` | how he moves |'
@@ -288,10 +245,9 @@ def test_the_table_has_one_row_per_parameter():
 
 
 def test_a_near_name_is_suggested_and_a_far_one_is_not():
-    assert did_you_mean('sped', ['steps', 'speed']) == " (did you mean 'speed'?)"
-    assert did_you_mean('colour', ['steps', 'speed']) == ''
-    assert did_you_mean(7, ['steps']) == ''
-    assert did_you_mean('x', []) == ''
+    near = parameters.did_you_mean
+    assert near('sped', ['steps', 'speed']) == " (did you mean 'speed'?)"
+    assert near('colour', ['steps', 'speed']) == near(7, ['steps']) == near('x', []) == ''
 
 
 # -- parameter files ------------------------------------------------------------------------------
@@ -302,6 +258,8 @@ def test_a_plain_mapping_and_a_ros_file_say_the_same():
     ros = '/**:\n  ros__parameters:\n    speed: 1.5\n    stops: [1, 2]\n'
     assert parameters_from_yaml(plain) == parameters_from_yaml(ros)
     assert parameters_from_yaml(ros) == {'speed': 1.5, 'stops': [1, 2]}
+    for nothing in ('', '# nothing\n', '/**:\n  ros__parameters:\n'):
+        assert parameters_from_yaml(nothing) == {}
 
 
 NODES = """
@@ -316,34 +274,23 @@ other_node:
 
 def test_a_node_takes_what_all_take_and_what_bears_its_name():
     assert parameters_from_yaml(NODES, node_name='walker_node') == {'speed': 2.0, 'steps': 2}
-    assert parameters_from_yaml(NODES, node_name='other_node') == {
-        'speed': 1.0, 'steps': 9, 'calm': False,
-    }  # fmt: skip
+    due = {'speed': 1.0, 'steps': 9, 'calm': False}
+    assert parameters_from_yaml(NODES, node_name='other_node') == due
     assert parameters_from_yaml(NODES, node_name='nobody') == {'speed': 1.0, 'steps': 2}
     assert parameters_from_yaml(NODES)['calm'] is False
-
-
-def test_later_sections_win():
-    turned = (
-        'walker_node:\n  ros__parameters: {speed: 2.0}\n/*:\n  ros__parameters: {speed: 1.0}\n'
-    )
-    assert parameters_from_yaml(turned, node_name='walker_node') == {'speed': 1.0}
-
-
-@pytest.mark.parametrize('text', ['', '# nothing\n', '/**:\n  ros__parameters:\n'])
-def test_nothing_is_no_parameter(text):
-    assert parameters_from_yaml(text) == {}
+    turned = NODES + '/*:\n  ros__parameters: {speed: 3.0}\n'  # later sections win
+    assert parameters_from_yaml(turned, node_name='walker_node') == {'speed': 3.0, 'steps': 2}
 
 
 @pytest.mark.parametrize(
     'text, words',
     [
-        ('speed: [1, 2', 'not a YAML file'),
         ('a: b: c', 'not a YAML file'),
         ('- 1\n- 2\n', 'must hold a mapping, this one holds a list'),
         ('just words', 'must hold a mapping, this one holds a str'),
-        ('7', 'must hold a mapping, this one holds a int'),
         ('speed: [1, 2]\ngap: 2026-13-45', 'not a YAML file'),
+        ('/**:\n  ros__parameters: 5\n', 'ros__parameters'),
+        ('a:\n  ros__parameters: [1]\n', 'ros__parameters'),
         ('[' * 100_000, 'not a YAML file: it is nested too deeply'),
         ('speed: ' + '1' * 1_000_001, 'more than 1000000 characters'),
         ('a: &a [1, *a]', 'its anchors multiply'),
@@ -358,26 +305,11 @@ def test_a_file_that_is_none_is_told_in_one_line(text, words):
     assert len(caught.value.problems) == 1 and '\n' not in str(caught.value)
 
 
-def test_anchors_that_do_not_multiply_are_used():
-    text = 'speed: &v 2.0\nlags: &l [1, 2]\nmore: [*v, *v, *l]\n'
-    assert parameters_from_yaml(text)['more'] == [2.0, 2.0, [1, 2]]
-
-
-def test_nan_in_a_file_is_refused_by_name():
-    values = parameters_from_yaml('speed: .nan\nweights: [0.5, .inf]\n')
-    assert problems(**values) == (
-        "parameter 'speed' must be finite, got nan",
-        "parameter 'weights' must be finite, got inf",
-    )
-
-
 @pytest.mark.parametrize('form', ['{}', '5:\n  ros__parameters: {{{}}}'])
 def test_keys_that_are_no_text_are_named(form):
     text = form.format('7: 1.0, true: 2' if '{{' in form else '7: 1.0\ntrue: 2\n')
-    assert problems(**parameters_from_yaml(text)) == (
-        "unknown parameter '7'",
-        "unknown parameter 'True'",
-    )
+    due = "unknown parameter '7'", "unknown parameter 'True'"
+    assert problems(**parameters_from_yaml(text)) == due
 
 
 def test_groups_of_parameters_are_named_not_guessed():
@@ -386,12 +318,6 @@ def test_groups_of_parameters_are_named_not_guessed():
     assert sentence == "unknown parameter 'ship.walker_node.ros__parameters.speed'"
     (sentence,) = problems(**parameters_from_yaml('speed: {mean: 1.0}'))
     assert sentence == "unknown parameter 'speed.mean' (did you mean 'speed'?)"
-
-
-@pytest.mark.parametrize('text', ['/**:\n  ros__parameters: 5\n', 'a:\n  ros__parameters: [1]\n'])
-def test_a_section_that_is_no_mapping_is_named(text):
-    with pytest.raises(ConfigError, match='ros__parameters'):
-        parameters_from_yaml(text)
 
 
 @given(st.text(max_size=40))
@@ -431,6 +357,8 @@ def test_a_file_is_parsed_once_however_often_it_is_asked(monkeypatch):
     assert len(parsed) == 1
 
 
-def test_the_anchors_of_a_file_without_any_are_not_counted(monkeypatch):
+def test_anchors_that_do_not_multiply_are_used_and_counted_only_where_there_are_some(monkeypatch):
+    text = 'speed: &v 2.0\nlags: &l [1, 2]\nmore: [*v, *v, *l]\n'
+    assert parameters_from_yaml(text)['more'] == [2.0, 2.0, [1, 2]]
     monkeypatch.setattr(yaml, 'compose', None)
     assert parameters_from_yaml('/**:\n  ros__parameters:\n    steps: 5\n') == {'steps': 5}

@@ -49,22 +49,25 @@ def in_navigation(entry):
     return set().union(*map(in_navigation, parts))
 
 
-def test_every_page_is_in_the_navigation(made):
+def test_every_page_is_in_the_navigation(made, monkeypatch):
     config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
     pages = {path.relative_to(ROOT / 'docs').as_posix() for path in (ROOT / 'docs').rglob('*.md')}
     pages |= {*made.OUTSIDE.values(), *(f'reference/api/{name}.md' for name in made.API)}
-    assert in_navigation(config['nav']) == pages | {
-        'reference/interfaces.md',
-        'reference/options.md',
-        'reference/bags.md',
-        *(f'examples/{path.stem}.md' for path in (ROOT / 'examples').glob('*.ipynb')),
-    }
-
-
-def test_every_recording_is_on_their_page(made):
+    pages |= {f'reference/{name}.md' for name in ('interfaces', 'options', 'bags')}
+    pages |= {f'examples/{path.stem}.md' for path in (ROOT / 'examples').glob('*.ipynb')}
+    assert in_navigation(config['nav']) == pages
     page = made.recordings()
     for path in (ROOT / 'bags').glob('*/README.md'):
         assert f'| [{path.parent.name}](#' in page and f'## {path.parent.name}\n' in page
+    # Links to notebooks lead to their pages; a site alone asks for no list of versions.
+    text = '[a](../../examples/own_data.ipynb), [b](../runs.md)'
+    shown = made.on_page_markdown(text, None, None, None)
+    assert shown == '[a](../examples/own_data.md), [b](../runs.md)'
+    given = SimpleNamespace(extra={'version': {'provider': 'mike'}})
+    monkeypatch.setenv('SITE_VERSIONS', '1')
+    assert 'version' in made.on_config(given).extra
+    monkeypatch.delenv('SITE_VERSIONS')
+    assert 'version' not in made.on_config(given).extra
 
 
 def test_the_api_has_every_public_module(made):
@@ -80,17 +83,9 @@ def test_the_api_has_every_public_module(made):
 
 
 def test_files_and_tests_named_on_pages_exist():
-    files = [
-        path.relative_to(ROOT)
-        for room in (
-            *('sonar_imm', 'sonar_imm_tools', 'msg_adapters', 'test'),
-            *('benchmarks', 'docs', 'examples'),
-        )
-        for path in (ROOT / room).rglob('*.py')
-    ]
-    sources = [
-        (ROOT / file).read_text(encoding='utf-8') for file in files if file.parts[0] == 'test'
-    ]
+    rooms = 'sonar_imm sonar_imm_tools msg_adapters test benchmarks docs examples'.split()
+    files = [path.relative_to(ROOT) for room in rooms for path in (ROOT / room).rglob('*.py')]
+    sources = [(ROOT / file).read_text(encoding='utf-8') for file in files if 'test' in file.parts]
     tests = {name for source in sources for name in re.findall(r'def (test_\w+)', source)}
     missing = set()
     for page in [*(ROOT / 'docs').rglob('*.md'), ROOT / 'README.md']:
@@ -137,31 +132,18 @@ def test_links_between_files_lead_somewhere():
     assert broken == set()
 
 
-def test_links_to_notebooks_lead_to_their_pages(made):
-    text = '[a](../../examples/own_data.ipynb), [b](../runs.md)'
-    shown = made.on_page_markdown(text, None, None, None)
-    assert shown == '[a](../examples/own_data.md), [b](../runs.md)'
-
-
-def test_a_site_alone_asks_for_no_list_of_versions(made, monkeypatch):
-    config = SimpleNamespace(extra={'version': {'provider': 'mike'}})
-    monkeypatch.setenv('SITE_VERSIONS', '1')
-    assert 'version' in made.on_config(config).extra
-    monkeypatch.delenv('SITE_VERSIONS')
-    assert 'version' not in made.on_config(config).extra
-
-
-def test_what_comes_from_another_server_is_seen(made):
+def test_what_comes_from_another_server_is_seen_and_the_search_needs_none(made):
+    config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
+    (script,) = config['extra']['polyfills']
+    assert 'iframe-worker' in script, 'else the plugin loads one of this name from afar'
+    assert 'offline' in config['plugins'] and (ROOT / 'docs' / script).is_file()
     page = (
         '<link rel="canonical" href="https://a.org/"><link rel=stylesheet href=assets/a.css>'
         '<a href="https://b.org">b</a><script src="https://c.org/c.js"></script>'
         '<link rel="stylesheet" href="//d.org/d.css"><img src=https://e.org/e.png>'
     )
-    assert made.loaded_from_afar(page) == [
-        'https://c.org/c.js',
-        '//d.org/d.css',
-        'https://e.org/e.png',
-    ]
+    due = ['https://c.org/c.js', '//d.org/d.css', 'https://e.org/e.png']
+    assert made.loaded_from_afar(page) == due
 
 
 def test_on_a_phone_each_cell_has_the_head_of_its_column(made):
@@ -173,13 +155,6 @@ def test_on_a_phone_each_cell_has_the_head_of_its_column(made):
     shown = made.on_page_content(page, None, None, None)
     assert '<td data-label="a">1</td>\n<td data-label="b c" style="x">2</td>' in shown
     assert shown.endswith('<td>')
-
-
-def test_the_search_needs_no_server():
-    config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
-    (script,) = config['extra']['polyfills']
-    assert 'iframe-worker' in script, 'else the plugin loads one of this name from afar'
-    assert 'offline' in config['plugins'] and (ROOT / 'docs' / script).is_file()
 
 
 # -- each row of SECURITY.md names a file of tests that exists --
@@ -222,18 +197,10 @@ def test_a_number_has_two_decimals_or_its_format(numbers):
     assert numbers.n('x>scenes>calm>share', '.0%') == '50 %'
     assert (numbers.n('x>runs'), numbers.n('x>all>1')) == ('20', '2.50')
     assert numbers.n('x>scenes>calm>kept') == numbers.n('x>scenes>rough>RMSE') == '-'
-
-
-def test_files_below_no_table_are_named_at_the_end(numbers):
-    assert numbers.sources() == ''
-    numbers.n('x>runs')
-    assert 'text: [x.json](x.json), 2026-11-29, abcd1234<' in numbers.sources()
-
-
-@pytest.mark.parametrize('path', ['x>scenes>storm>RMSE', 'x>runs>RMSE', 'x>all>2', 'x>all>first'])
-def test_a_number_that_is_missing_is_named(numbers, path):
-    with pytest.raises(LookupError, match=re.escape(path)):
-        numbers.n(path)
+    assert 'text: [x.json](x.json), 2026-11-29, abcd1234<' in numbers.sources()  # at the end
+    for path in ('x>scenes>storm>RMSE', 'x>runs>RMSE', 'x>all>2', 'x>all>first'):
+        with pytest.raises(LookupError, match=re.escape(path)):
+            numbers.n(path)
 
 
 def test_a_table_has_a_row_for_each_entry_and_a_caption(numbers):
@@ -246,12 +213,9 @@ def test_a_table_has_a_row_for_each_entry_and_a_caption(numbers):
     assert numbers.sources() == ''
     short = numbers.table('x>{col}', {'share': 'scenes>@>share'}, {'a': 'rough'}, caption=False)
     assert short.splitlines()[2:] == ['| a | 0.25 |']
-
-
-@pytest.mark.parametrize('columns', [{'a': 'RMSE', 'b': 'rmse'}, {'a': 'cover'}])
-def test_a_row_or_a_column_without_numbers_is_an_error(numbers, columns):
-    with pytest.raises(LookupError):
-        numbers.table('x>scenes>{row}>{col}', columns)
+    for missing in ({'a': 'RMSE', 'b': 'rmse'}, {'a': 'cover'}):
+        with pytest.raises(LookupError):
+            numbers.table('x>scenes>{row}>{col}', missing)
 
 
 def test_a_table_replaces_the_one_of_the_same_head():

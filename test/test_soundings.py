@@ -35,6 +35,8 @@ def test_one_row_for_each_bin_with_an_echo_in_the_types_of_the_contract():
     assert all(soundings.columns[name].dtype == kind for name, kind in COLUMNS.items())
     assert soundings.columns['x'].tolist() == [0.0, 3.0, 9.0, 12.0, 15.0]
     assert (soundings.stamp_ns, soundings.frame_id) == (7, 'map')
+    columns = soundings.columns  # without layover there is one surface
+    assert (columns['surface'] == 1).all() and (columns['existence'] == 0.0).all()
 
 
 def test_rows_that_are_not_known_throughout_are_left_out():
@@ -45,10 +47,8 @@ def test_rows_that_are_not_known_throughout_are_left_out():
 
 
 def test_a_second_surface_follows_the_first_one_of_its_bin():
-    nothing = np.full(6, np.nan)
-    upper = {f'{name}_2': nothing.copy() for name in ('px', 'py', 'pz', 'beam_angle')}
-    for name in ('height', 'vertical_uncertainty', 'horizontal_uncertainty'):
-        upper[f'{name}_2'] = nothing.copy()
+    names = 'px py pz beam_angle height vertical_uncertainty horizontal_uncertainty'.split()
+    upper = {f'{name}_2': np.full(6, np.nan) for name in names}
     for k in (1, 2):  # bin 2 is no sounding at all
         for value, column in enumerate(upper.values()):
             column[k] = 10.0 * k + value
@@ -61,11 +61,6 @@ def test_a_second_surface_follows_the_first_one_of_its_bin():
     assert columns['x'].tolist() == [0.0, 3.0, 10.0, 9.0, 12.0, 15.0]
     assert (columns['px'][2], columns['py'][2], columns['pz'][2]) == (10.0, 11.0, 12.0)
     assert columns['beam_angle'][2] == 13.0 and columns['vertical_uncertainty'][2] == 15.0
-
-
-def test_without_layover_there_is_one_surface():
-    columns = soundings_of(estimate()).columns
-    assert (columns['surface'] == 1).all() and (columns['existence'] == 0.0).all()
 
 
 def test_estimates_without_navigation_have_no_soundings():

@@ -15,6 +15,8 @@ import sys
 
 import pytest
 
+from sonar_imm.trackers import SYSTEMS
+
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = ('OPENBLAS', 'GOTO', 'OMP', 'MKL', 'BLIS')
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else 0
@@ -42,15 +44,12 @@ def threads_of(tmp_path_factory):
     tmp_path = tmp_path_factory.mktemp('witness')
     (tmp_path / 'sitecustomize.py').write_text(WITNESS)
 
-    def run(*arguments, **message):
-        kept = {
-            name: value
-            for name, value in os.environ.items()
-            if not name.startswith(tuple(f'{each}_NUM_THREADS' for each in SETTINGS))
-        }
+    def run(*arguments, **said):
+        told = tuple(f'{each}_NUM_THREADS' for each in SETTINGS)
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(told)}
         paths = os.pathsep.join([str(tmp_path), str(ROOT), str(ROOT / 'test')])
         done = subprocess.run(
-            [sys.executable, *arguments], env={**kept, 'PYTHONPATH': paths, **message},
+            [sys.executable, *arguments], env={**kept, 'PYTHONPATH': paths, **said},
             capture_output=True, text=True, cwd=tmp_path,
         )  # fmt: skip
         assert 'threads ' in done.stderr, done.stderr
@@ -113,11 +112,9 @@ def test_a_node_has_one_thread_of_algebra(threads_of, loaded_alone, start):
 
 
 def test_every_node_has_its_command():
-    from sonar_imm.trackers import SYSTEMS
-
     text = (ROOT / 'setup.py').read_text(encoding='utf-8')
-    assert "f'{system}_node = sonar_imm.nodes.commands:main'" in text
-    assert "'fls_detector_node = sonar_imm.nodes.commands:main'" in text
+    for name in ("f'{system}", "'fls_detector"):
+        assert f"{name}_node = sonar_imm.nodes.commands:main'" in text
     for name in (*SYSTEMS, 'fls_detector'):
         module = (ROOT / 'sonar_imm' / 'nodes' / f'{name}.py').read_text(encoding='utf-8')
         assert '\ndef main(' in module

@@ -21,18 +21,20 @@ import click
 import sonar_imm
 from sonar_imm.trackers import SYSTEMS
 
-from .common import BAG, example, json_option, node_file, print_json, say
+from . import options as opt
+from .common import node_file, print_json, say
 
 
 # fmt: off
-@click.command(epilog=example('sonar-imm bench', 'sonar-imm bench diver --json --skip-node'))
-@click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
-@click.option('--rounds', type=click.IntRange(min=1), default=7, show_default=True,
+@click.command(epilog=opt.example('sonar-imm bench', 'sonar-imm bench diver --json --skip-node'))
+@opt.systems
+@click.option('--rounds', type=opt.COUNT, default=7, show_default=True,
     help='Paired rounds against other programs.')
-@click.option('--bag', type=BAG, help='Recording to time the node with; a shipped one by default.')
+@click.option('--bag', type=opt.PATH,
+    help='Recording to time the node with; a shipped one by default.')
 @click.option('--skip-node', is_flag=True, help='Leave out the live node (needs ROS 2).')
 @click.option('--strict', is_flag=True, help='Exit code 1 when a measurement misses its goal.')
-@json_option
+@opt.json
 def command(
     systems: tuple[str, ...], rounds: int, bag: Path | None, skip_node: bool, strict: bool,
     as_json: bool,
@@ -51,11 +53,8 @@ def command(
         results[system] = _measure(speed, system, rounds, quiet=as_json)
         if not skip_node:
             results[system]['node_ms'] = latency = _node_latency(system, bag)
-            say(
-                f'  live node, message to estimate: p50 {latency["p50"]:.2f} ms, '
-                f'p99 {latency["p99"]:.2f} ms',
-                quiet=as_json,
-            )
+            delays = f'p50 {latency["p50"]:.2f} ms, p99 {latency["p99"]:.2f} ms'
+            say(f'  live node, message to estimate: {delays}', quiet=as_json)
     if as_json:
         print_json(results)
     if strict and not all(

@@ -15,13 +15,14 @@ from concurrent.futures import as_completed
 import functools
 from pathlib import Path
 import tempfile
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import click
 
 from sonar_imm.trackers import SYSTEMS
 
-from .common import BAG, example, json_option, params_option, print_json, say, warn
+from . import options as opt
+from .common import print_json, say, warn
 
 if TYPE_CHECKING:
     from .checking import CheckedRecording, PlayedRecording
@@ -29,17 +30,17 @@ if TYPE_CHECKING:
 
 # fmt: off
 @click.command(
-    epilog=example('sonar-imm check diver', 'sonar-imm check diver --bag dive.bag --limit 3'))
-@click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
-@click.option('--bag', type=BAG, help='Play this recording instead of the shipped ones.')
-@params_option('Parameter file for the node and the offline run.')
-@click.option('--limit', type=click.FloatRange(min=0.0), metavar='ERROR',
+    epilog=opt.example('sonar-imm check diver', 'sonar-imm check diver --bag dive.bag --limit 3'))
+@opt.systems
+@click.option('--bag', type=opt.PATH, help='Play this recording instead of the shipped ones.')
+@opt.params(help='Parameter file for the node and the offline run.')
+@click.option('--limit', type=opt.NOT_NEGATIVE, metavar='ERROR',
     help='Largest error allowed, of the kind and in the unit that the check prints, e.g. position '
     'RMSE in metres for the diver. By default that of the recording (check.yaml in its folder), '
     'or else of the system.')
-@click.option('--out', type=click.Path(path_type=Path, file_okay=False),
+@click.option('--out', type=opt.FOLDER,
     help='Keep both runs in this folder.')
-@json_option
+@opt.json
 def command(
     systems: tuple[str, ...], bag: Path | None, params: Path | None, limit: float | None,
     out: Path | None, as_json: bool,
@@ -52,14 +53,8 @@ def command(
     if bag is not None and len(systems or SYSTEMS) > 1:
         raise click.UsageError('--bag needs exactly one system')
     with tempfile.TemporaryDirectory(prefix='sonar_imm_check_') as scratch:
-        recordings = run_checks(
-            systems or tuple(SYSTEMS),
-            out or Path(scratch),
-            bag=bag,
-            params=params,
-            limit=limit,
-            quiet=as_json,
-        )
+        asked: dict[str, Any] = {'bag': bag, 'params': params, 'limit': limit, 'quiet': as_json}
+        recordings = run_checks(systems or tuple(SYSTEMS), out or Path(scratch), **asked)
     if as_json:
         print_json([recording.as_dict() for recording in recordings])
     else:
@@ -147,12 +142,8 @@ def print_checks(recording: CheckedRecording) -> None:
     """Print the checks of one recording."""
     say(f'{recording.system}: {recording.bag.name}')
     for check in recording.checks:
-        say(
-            f'  {"ok  " if check.good else "FAIL"}  {check.name}: {check.result}'
-            f' (wanted: {check.wanted})'
-        )
-    if recording.latency_ms:
-        say(
-            f'        latency of an estimate: p50 {recording.latency_ms["p50"]:.1f} ms, '
-            f'p99 {recording.latency_ms["p99"]:.1f} ms'
-        )
+        state = 'ok  ' if check.good else 'FAIL'
+        say(f'  {state}  {check.name}: {check.result} (wanted: {check.wanted})')
+    if latency := recording.latency_ms:
+        delays = f'p50 {latency["p50"]:.1f} ms, p99 {latency["p99"]:.1f} ms'
+        say(f'        latency of an estimate: {delays}')

@@ -84,17 +84,15 @@ class PlayedRecording:
         judgement = evaluate_run(self.folder / 'offline')
         accuracy = judgement.accuracy(self.limit)
         checks = self.checks if accuracy is None else (*self.checks, accuracy)
-        return CheckedRecording(
-            self.system, self.bag, self.folder, checks, self.latency_ms, judgement
-        )
+        where = self.system, self.bag, self.folder
+        return CheckedRecording(*where, checks, self.latency_ms, judgement)
 
 
 def shipped_bags(system: str, scratch: Path) -> list[Path]:
     """The recordings of `system` that come with the package.
 
     An installation has the small ones only (setup.py): where it has none of a system, the first
-    is simulated into `scratch`. Raises FileNotFoundError if none is known, `BagError` without a
-    recipe.
+    is simulated into `scratch`. Raises FileNotFoundError for none, `BagError` without a recipe.
     """
     known = sorted(path for path in (share_folder() / 'bags').glob(f'{system}_*'))
     if not known:
@@ -120,8 +118,8 @@ def instruments_in(bag: Path, system: str) -> dict[str, dict[str, str] | None]:
     if len(found) == 1:
         return {'': None}
     return {
-        name: {topic: entry.name for topic, entry in inputs.items()}
-        for name, inputs in found.items()
+        instrument: {topic: entry.name for topic, entry in inputs.items()}
+        for instrument, inputs in found.items()
     }
 
 
@@ -153,32 +151,16 @@ def play_recording(
         origin=node.stated_origin(),
         detector=load_detector(SYSTEMS[system], used, {}),
     )
-    run = track_one(
-        Job(
-            bag=bag,
-            folder=folder / 'offline',
-            instrument='',
-            system=system,
-            config=config,
-            options=options,
-            overwrite=True,
-        ),
-        quiet,
-    )
+    made_of: dict[str, Any] = {'system': system, 'config': config, 'options': options}
+    run = track_one(Job(bag=bag, folder=folder / 'offline', overwrite=True, **made_of), quiet)
     if not live:
         return PlayedRecording(system, bag, folder, limit, (), {})
     with (
         progress('playing to the node', run['messages'], quiet=quiet) as advance,
         node_file(SYSTEMS[system], used) as given,
     ):
-        played = run_lockstep(
-            bag,
-            system,
-            params_file=given,
-            settings=config.as_dict(),
-            topics=topics,
-            progress=advance,
-        )
+        settings: dict[str, Any] = {'settings': config.as_dict(), 'topics': topics}
+        played = run_lockstep(bag, system, params_file=given, progress=advance, **settings)
     # In the same form as the offline run.
     with RunFolder(folder / 'live').fresh(overwrite=True) as live_folder:
         live_folder.write_estimates(final_estimates(played.estimates, config), system)

@@ -6,13 +6,12 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What several subcommands share: ``--set``, ``--params``, JSON and progress."""
+"""What several subcommands share: parameters, JSON and progress."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
-import functools
 import json
 from pathlib import Path
 import sys
@@ -23,7 +22,6 @@ from typing import Any
 import click
 
 from msg_adapters.inputs import FEEDERS
-from sonar_imm.gone import GONE
 from sonar_imm.node_config import chosen_types, DetectorNodeConfig, node_config_type, NodeConfig
 from sonar_imm.parameters import (
     Config,
@@ -35,87 +33,19 @@ from sonar_imm.parameters import (
     unknown_parameters,
 )
 from sonar_imm.texts import visible
-from sonar_imm.trackers import System, SYSTEMS
+from sonar_imm.trackers import System
 
 from ..recordings.own_files import OF_FRAMES, OwnParameters, write_ros_parameters
 
 Advance = Callable[[int], None]
 
-BAG = click.Path(path_type=Path)
 SECONDS_BETWEEN_LINES = 5.0
 OF_EVERY_NODE = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 """Parameters that `ros2 param dump` writes of every node, and no tracker needs."""
 
 
-def example(*lines: str) -> str:
-    """The epilog of a help page: example command lines, kept as they are."""
-    return '\b\nExample:\n' + '\n'.join(f'  {line}' for line in lines)
-
-
-def _coordinates(
-    _ctx: click.Context, _param: click.Parameter, value: str
-) -> tuple[float, float, float]:
-    try:
-        numbers = tuple(float(part) for part in value.split(','))
-    except ValueError:
-        numbers = ()
-    if len(numbers) not in (2, 3):
-        raise click.BadParameter(f"'{value}' is not of the form X,Y or X,Y,Z")
-    x, y, z = (*numbers, 0.0)[:3]
-    return x, y, z
-
-
-def params_option(help: str) -> Callable[..., Any]:
-    """``--params FILE``."""
-    return click.option('--params', type=click.Path(path_type=Path, dir_okay=False), help=help)
-
-
-def timeout_option(default: float, *, when: str = '') -> Callable[..., Any]:
-    """``--timeout SECONDS``, of a command that listens to nodes."""
-    ends = 'with 1 when nothing is heard for so long from the start.'
-    return click.option('--timeout', type=click.FloatRange(min=0.0, min_open=True),
-        default=default, show_default=True, metavar='SECONDS',
-        help=f'{when}: end {ends}' if when else f'End {ends}')  # fmt: skip
-
-
-def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
-    """An option of the form NAME=VALUE that may be repeated; the command gets a dict."""
-
-    def split(
-        _ctx: click.Context, _param: click.Parameter, values: Iterable[str]
-    ) -> dict[str, str]:
-        pairs = {}
-        for value in values:
-            name, equals, text = value.partition('=')
-            if not equals or not name.strip():
-                raise click.BadParameter(f"'{value}' is not of the form {metavar}")
-            pairs[name.strip()] = text.strip()
-        return pairs
-
-    return click.option(*names, metavar=metavar, multiple=True, callback=split, help=help)
-
-
-# Options of several commands.
-# fmt: off
-json_option = click.option('--json', 'as_json', is_flag=True, help='Print the result as JSON.')
-set_option = pairs_option('--set', 'overrides', metavar='NAME=VALUE',
-    help='Change one parameter; may be given several times.')
-topic_option = pairs_option('--topic', 'topics', metavar='INPUT=TOPIC',
-    help='Topic of an input, e.g. fix=/usbl/pose; may be given several times.')
-system_option = click.option('--system', type=click.Choice(list(SYSTEMS)), default=None,
-    help='Which tracker; by default the one whose inputs are in the bag.')
-crs_option = click.option('--crs', '--epsg', 'epsg', type=click.IntRange(min=1),
-    help='Coordinate system, by its EPSG number.')
-origin_option = click.option('--origin', default='0,0', callback=_coordinates, metavar='X,Y[,Z]',
-    help='Coordinates in that system of the origin of the navigation.')
-jobs_option = functools.partial(click.option, '--jobs', type=click.IntRange(min=1), default=1,
-    show_default=True)
-# fmt: on
-
-
 def typed_overrides(config_type: type[Config], overrides: dict[str, str]) -> dict[str, Any]:
-    """Texts of ``--set`` in the types of the parameters. Others stay texts; Config refuses
-    them."""
+    """Texts of ``--set`` in the types of the parameters; of others texts, which Config refuses."""
     specs = specs_with(config_type, {}, overrides)
     return {name: _typed(text, specs.get(name)) for name, text in overrides.items()}
 
@@ -160,7 +90,7 @@ def load_config(
     tracker, node = system.config_type(), node_config_type(system)
     values = _parameters_of(params, system, system.name, report=True) if params else {}
     specs = {spec.name: spec for spec in node.specs()} | specs_with(tracker, values, overrides)
-    values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
+    values |= {name: _typed(text, specs.get(name)) for name, text in overrides.items()}
     others = _detector_specs(system)
     if unknown := [name for name in values if name not in specs and name not in others]:
         raise ConfigError(*unknown_parameters(unknown, specs))
@@ -188,9 +118,7 @@ def load_detector(
     # A file for the tracker's node alone says nothing of the detector.
     feeder = FEEDERS[system.name]
     values = _parameters_of(params, system, feeder, needed=False) if params else {}
-    values.update(
-        {name: _typed(text, specs[name]) for name, text in overrides.items() if name in specs}
-    )
+    values |= {k: _typed(text, specs[k]) for k, text in overrides.items() if k in specs}
     config = DetectorConfig.from_mapping(values, ignore_unknown=True)
     defaults = DetectorConfig().as_dict()
     return {k: value for k, value in config.as_dict().items() if value != defaults[k]}
@@ -207,8 +135,7 @@ def _detector_specs(system: System) -> dict[str, ParameterSpec]:
 
 @contextlib.contextmanager
 def node_file(system: System, params: Path | OwnParameters | None) -> Iterator[Path | None]:
-    """Yields a parameter file for real nodes: `params`, of a recording's own one a copy of what is
-    taken from it."""
+    """Yields a parameter file for real nodes: `params`, of a recording's own one what is taken."""
     if not isinstance(params, OwnParameters):
         yield params
         return
@@ -249,8 +176,7 @@ def _parameters_of(
     needed: bool = True,
     report: bool = False,
 ) -> dict[str, Any]:
-    """What a file says for a node of `system`; needed: it is a mistake when it is for others
-    only."""
+    """What a file says for a node of `system`; needed: one for others only is a mistake."""
     if isinstance(path, OwnParameters):
         values = _taken(path, system, node_name, report)
     else:
@@ -269,17 +195,6 @@ def _parameters_of(
                 "section, or call it '/**' for any node"
             )
     return {key: value for key, value in values.items() if key.split('.')[0] not in OF_EVERY_NODE}
-
-
-class Renewed(click.Command):
-    """A command that says what took the place of its removed options."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        for word in args:
-            option = word.partition('=')[0]
-            if gone := GONE.get(f'option {ctx.info_name} {option}'):
-                ctx.fail(f"'{option}' {gone}")
-        return super().parse_args(ctx, args)
 
 
 def print_json(result: Any) -> None:
@@ -301,8 +216,7 @@ def say(text: str = '', *, quiet: bool = False) -> None:
 
 
 def warn(text: str) -> None:
-    """Print one line on standard error. Names in it may hold anything, so only this and `say`
-    print sentences."""
+    """Print one line on standard error. Names may hold anything: only this and `say` print."""
     click.echo(visible(' '.join(text.split())), err=True)
 
 
@@ -322,18 +236,14 @@ def progress(
             task = bar.add_task(first or what, total=total)
             yield lambda count: bar.update(task, advance=count, description=what)
     else:
-        yield _plain_progress(what, total)
+        # A line every few seconds, so that the log of a short job stays empty.
+        done, printed = 0, time.monotonic()
 
+        def advance(count: int) -> None:
+            nonlocal done, printed
+            done += count
+            if time.monotonic() - printed > SECONDS_BETWEEN_LINES:
+                printed = time.monotonic()
+                warn(f'{what}: {done} of {total}')
 
-def _plain_progress(what: str, total: int) -> Advance:
-    """A line every few seconds, so that the log of a short job stays empty."""
-    done, printed = 0, time.monotonic()
-
-    def advance(count: int) -> None:
-        nonlocal done, printed
-        done += count
-        if time.monotonic() - printed > SECONDS_BETWEEN_LINES:
-            printed = time.monotonic()
-            warn(f'{what}: {done} of {total}')
-
-    return advance
+        yield advance

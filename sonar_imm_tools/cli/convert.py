@@ -23,26 +23,12 @@ from sonar_imm.trackers import SYSTEMS
 
 from ..recordings.convert_options import DETECTING, FROM_BAGS, OPTIONS
 from ..recordings.options import Group, Option, spec_of
-from .common import (
-    BAG,
-    by_topic,
-    example,
-    jobs_option,
-    json_option,
-    load_detector,
-    pairs_option,
-    print_json,
-    progress,
-    say,
-    typed_overrides,
-    warn,
-)
+from . import options as opt
+from .common import by_topic, load_detector, print_json, progress, say, typed_overrides, warn
 from .info import track_line
 
 if TYPE_CHECKING:
     from ..recordings.conversion import ConversionReport
-
-FILE = click.Path(path_type=Path, dir_okay=False)
 
 
 class Convert(click.Group):
@@ -60,8 +46,7 @@ class Convert(click.Group):
             from ..recordings.sniffing import sniff
 
             guess = sniff(source, _named_columns(args))
-            taken = f'{source} is taken for {guess.why}: convert {guess.kind}'
-            warn(taken)
+            warn(f'{source} is taken for {guess.why}: convert {guess.kind}')
             args = [guess.kind, *args]
         elif source.suffix:
             ctx.fail(f'{source} does not exist')
@@ -78,7 +63,7 @@ def _named_columns(args: Sequence[str]) -> dict[str, str]:
 
 # fmt: off
 @click.group(cls=Convert, invoke_without_command=True,
-    epilog=example('sonar-imm convert usbl.csv dive.bag',
+    epilog=opt.example('sonar-imm convert usbl.csv dive.bag',
         'sonar-imm convert fixes usbl.csv dive.bag --column x=easting --column y=northing'))
 @click.pass_context
 def command(ctx: click.Context) -> None:
@@ -106,15 +91,14 @@ def _add_subcommand(kind: str, options: type) -> None:
         print_json(_described(report)) if as_json else _print(report)
 
     examples = (f'sonar-imm convert {kind} {line}' for line in options.EXAMPLES)  # type: ignore[attr-defined]
-    subcommand = click.Command(
-        kind, callback=run, help=inspect.getdoc(options), epilog=example(*examples)
-    )
-    click.argument('source', metavar='IN', type=BAG)(subcommand)
-    click.argument('out_bag', type=BAG, required=False)(subcommand)
+    about: dict[str, Any] = {'help': inspect.getdoc(options), 'epilog': opt.example(*examples)}
+    subcommand = click.Command(kind, callback=run, **about)
+    click.argument('source', metavar='IN', type=opt.PATH)(subcommand)
+    click.argument('out_bag', type=opt.PATH, required=False)(subcommand)
     for decorate in _click_options(options):
         decorate(subcommand)
-    jobs_option(help='Processes, for a folder of several.')(subcommand)
-    json_option(subcommand)
+    opt.jobs(help='Processes, for a folder of several.')(subcommand)
+    opt.json(subcommand)
     command.add_command(subcommand)
 
 
@@ -140,7 +124,7 @@ def _click_option(
 ) -> Callable[..., Any]:
     text = spec.help.format(what=what) if what else spec.help
     if spec.kind == 'pairs':
-        return pairs_option(flag, name, metavar=spec.metavar, help=text)
+        return opt.pairs(flag, name, metavar=spec.metavar, help=text)
     needed = default is attrs.NOTHING
     shown = None if needed or spec.parse or default in (None, '', ()) else default
     if spec.many and shown:
@@ -179,7 +163,7 @@ def _click_type(spec: Option) -> Any:
     if spec.kind == 'speed':
         return _SpeedOfSound(*spec.range)
     if spec.kind not in ('float', 'int'):
-        return FILE if spec.kind == 'file' else str
+        return opt.FILE if spec.kind == 'file' else str
     low, high = spec.range
     if spec.kind == 'int':
         least, most = (None if limit is None else int(limit) for limit in (low, high))
@@ -190,7 +174,7 @@ def _click_type(spec: Option) -> Any:
 
 
 def _parsed(parse: Callable[[str], Any]) -> Callable[..., Any]:
-    def callback(_ctx: click.Context, _param: click.Parameter, text: str | None) -> Any:
+    def callback(_ctx: Any, _param: Any, text: str | None) -> Any:
         try:
             return None if text is None else parse(text)
         except ValueError as error:

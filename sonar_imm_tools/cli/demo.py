@@ -20,16 +20,18 @@ import click
 from sonar_imm.trackers import SYSTEMS
 
 from ..evaluation.numbers import counted
+from . import options as opt
 from .check import print_checks, run_checks
-from .common import example, say
+from .common import say
 
 if TYPE_CHECKING:
     from .checking import CheckedRecording
 
 
 # fmt: off
-@click.command(epilog=example('sonar-imm demo --out demo', 'sonar-imm demo --system diver --all'))
-@click.option('--out', type=click.Path(path_type=Path, file_okay=False), default=Path('demo'),
+@click.command(
+    epilog=opt.example('sonar-imm demo --out demo', 'sonar-imm demo --system diver --all'))
+@click.option('--out', type=opt.FOLDER, default=Path('demo'),
     show_default=True, help='Folder for the runs and the report.')
 @click.option('--system', 'systems', multiple=True, type=click.Choice(list(SYSTEMS)),
     help='Show this system alone; may be repeated. All by default.')

@@ -23,7 +23,9 @@ import click
 from sonar_imm.estimates import model_columns
 from sonar_imm.texts import visible
 
-from .common import example, say, timeout_option, warn
+from ..evaluation.numbers import counted
+from . import options as opt
+from .common import say, warn
 
 if TYPE_CHECKING:
     from ..replay.listening import ReceivedTable
@@ -36,14 +38,15 @@ Show = Callable[['ReceivedTable'], None]
 
 # fmt: off
 @click.command(
-    epilog=example('sonar-imm echo', 'sonar-imm echo /diver/estimate --once',
+    epilog=opt.example('sonar-imm echo', 'sonar-imm echo /diver/estimate --once',
         'sonar-imm echo /obstacle/estimate --json | jq .columns.range'))
 @click.argument('topics', metavar='[TOPIC]...', nargs=-1)
 @click.option('--once', is_flag=True, help='Show one table and end; the same as --count 1.')
-@click.option('--count', type=click.IntRange(min=1), help='End after so many tables.')
-@click.option('--rows', type=click.IntRange(min=1), default=20, show_default=True,
+@click.option('--count', type=opt.COUNT, help='End after so many tables.')
+@click.option('--rows', type=opt.COUNT, default=20, show_default=True,
     help='Most rows of a table to show; --json has all.')
-@timeout_option(10.0)
+@click.option('--timeout', type=opt.POSITIVE, default=10.0, show_default=True,
+    metavar='SECONDS', help='End with 1 when nothing is heard for so long from the start.')
 @click.option('--json', 'as_json', is_flag=True, help='One line of JSON for each table.')
 def command(
     topics: tuple[str, ...], once: bool, count: int | None, rows: int, timeout: float,
@@ -79,7 +82,6 @@ def command(
 
 @contextlib.contextmanager
 def _shower(most: int, as_json: bool) -> Iterator[Show]:
-    """What shows one table."""
     if as_json:
         yield lambda table: click.echo(json_line(table))
     elif sys.stdout.isatty():
@@ -130,9 +132,9 @@ def text_lines(table: ReceivedTable, most: int) -> list[str]:
         return [f'{table.topic}: {table.problem}']
     names, rows = readable(table.columns or {}, most)
     widths = {name: max([len(name), *(len(row[name]) for row in rows)]) for name in names}
-    lines = [_head(table), '  '.join(f'{name:>{widths[name]}}' for name in names)]
-    lines += ['  '.join(f'{row[name]:>{widths[name]}}' for name in names) for row in rows]
-    return [line for line in (*lines, _further(table, most)) if line]
+    shown = [dict(zip(names, names)), *rows]
+    lines = ['  '.join(f'{row[name]:>{widths[name]}}' for name in names) for row in shown]
+    return [line for line in (_head(table), *lines, _further(table, most)) if line]
 
 
 def json_line(table: ReceivedTable) -> str:
@@ -154,10 +156,9 @@ def json_line(table: ReceivedTable) -> str:
 def _head(table: ReceivedTable) -> str:
     moment = datetime.fromtimestamp(table.stamp_ns // 10**9, timezone.utc)
     millis = table.stamp_ns % 10**9 // 10**6
-    rows = _count(table)
     return (
         f'{table.topic}  {moment:%Y-%m-%d %H:%M:%S}.{millis:03d} UTC  '
-        f'frame {table.frame_id or "(none)"}  {rows} row{"" if rows == 1 else "s"}'
+        f'frame {table.frame_id or "(none)"}  {counted(_count(table), "row")}'
     )
 
 

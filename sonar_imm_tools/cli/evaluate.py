@@ -15,35 +15,36 @@ from pathlib import Path
 import click
 
 from ..evaluation.judging import judge, Judgement, JudgeOptions, TRUTH_GAP
-from .common import BAG, example, json_option, print_json, say
+from . import options as opt
+from .common import print_json, say
 
 
 # fmt: off
 @click.command(
-    epilog=example('sonar-imm evaluate out',
+    epilog=opt.example('sonar-imm evaluate out',
         'sonar-imm evaluate out --truth gps.bag --report gps.html',
         'sonar-imm evaluate line1 line9 --crossing'))
-@click.argument('out_dir', type=click.Path(path_type=Path))
-@click.argument('other', metavar='[OTHER]', required=False, type=click.Path(path_type=Path))
-@click.option('--truth', 'truth_bag', type=BAG,
+@click.argument('out_dir', type=opt.PATH)
+@click.argument('other', metavar='[OTHER]', required=False, type=opt.PATH)
+@click.option('--truth', 'truth_bag', type=opt.PATH,
     help='Bag with /truth/estimate; by default the tracked bag itself.')
 @click.option('--truth-lag', type=float, default=0.0, show_default=True, metavar='SECONDS',
     help='Compare an estimate with truth this much later.')
-@click.option('--truth-gap', type=click.FloatRange(min=0.0), default=TRUTH_GAP, show_default=True,
+@click.option('--truth-gap', type=opt.NOT_NEGATIVE, default=TRUTH_GAP, show_default=True,
     metavar='SECONDS', help='Truth is not interpolated across longer gaps.')
-@click.option('--cutoff', type=click.FloatRange(min=0.0, min_open=True), metavar='METRES',
+@click.option('--cutoff', type=opt.POSITIVE, metavar='METRES',
     help='An estimate further away from all targets is on none of them; the default depends on '
     'the system: for divers six times the median distance of the raw fixes (of the tracks where '
     'there are none) from the truth, and at least 10.')
-@click.option('--report', type=click.Path(path_type=Path, dir_okay=False),
+@click.option('--report', type=opt.FILE,
     help='Where to write the report; by default OUT_DIR/report.html.')
 @click.option('--crossing', is_flag=True,
     help='Compare the horizons of two fathometer runs, OUT_DIR and OTHER, where they cross.')
-@click.option('--position-std', type=click.FloatRange(min=0.0), default=3.0, show_default=True,
+@click.option('--position-std', type=opt.NOT_NEGATIVE, default=3.0, show_default=True,
     metavar='METRES',
     help='crossing: error of a position, which counts by the slope of a horizon.')
 @click.option('--no-report', is_flag=True, help='Only write metrics.json.')
-@json_option
+@opt.json
 def command(
     out_dir: Path, other: Path | None, truth_bag: Path | None, truth_lag: float, truth_gap: float,
     cutoff: float | None, report: Path | None, crossing: bool, position_std: float,
@@ -70,6 +71,7 @@ def command(
         if report is not None:
             RunFolder(folder).keep_from(report, but=REPORT)
     options = JudgeOptions(truth_bag=truth_bag, lag=truth_lag, gap=truth_gap, cutoff=cutoff)
+    names = {folder: folder.relative_to(out_dir).as_posix() for folder in folders}
     judgements = {folder: evaluate_run(folder, options) for folder in folders}
     page = None if no_report else report or out_dir / 'report.html'
     if page is not None:
@@ -77,18 +79,16 @@ def command(
 
         write_report(page, [judgement.part([]) for judgement in judgements.values()])
     if as_json:
-        metrics = {_name(folder, out_dir): run.metrics for folder, run in judgements.items()}
+        metrics = {names[folder]: run.metrics for folder, run in judgements.items()}
         print_json(metrics.get('.', metrics))
         return
     for folder, judgement in judgements.items():
-        _print(judgement, '' if folder == out_dir else f'{_name(folder, out_dir)}: ')
+        say(f'{"" if folder == out_dir else f"{names[folder]}: "}{judgement.summary}')
+        for title, value in judgement.lines:
+            say(f'  {title:<34} {value}')
     if page is not None:
         say(f'report: {page}')
 # fmt: on
-
-
-def _name(folder: Path, out_dir: Path) -> str:
-    return folder.relative_to(out_dir).as_posix()
 
 
 def _compare_crossing(
@@ -129,9 +129,3 @@ def evaluate_run(out_dir: Path, options: JudgeOptions | None = None) -> Judgemen
     judgement = judge(folder, options)
     folder.write_json(METRICS, judgement.metrics)
     return judgement
-
-
-def _print(judgement: Judgement, name: str) -> None:
-    say(f'{name}{judgement.summary}')
-    for title, value in judgement.lines:
-        say(f'  {title:<34} {value}')

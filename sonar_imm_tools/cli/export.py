@@ -18,7 +18,8 @@ import click
 
 from sonar_imm.files import whole
 
-from .common import crs_option, example, json_option, origin_option, print_json, say
+from . import options as opt
+from .common import print_json, say
 
 FORMATS = ('xyz', 'las', 'laz', 'tif')
 HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
@@ -27,24 +28,24 @@ TRACK_FORMATS = ('gpx', 'kml', 'geojson', 'csv', 'parquet')
 
 # fmt: off
 @click.command(
-    epilog=example('sonar-imm export out survey.laz --epsg 32632 --origin 500000,6000000',
+    epilog=opt.example('sonar-imm export out survey.laz --epsg 32632 --origin 500000,6000000',
         'sonar-imm export out survey.tif --cell 0.5 --epsg 32632 --origin 500000,6000000',
         'sonar-imm export out survey.csv', 'sonar-imm export out horizons.csv --epsg 32615',
         'sonar-imm export out picks.sgy --segy line.seg', 'sonar-imm export out tracks.gpx',
         'sonar-imm export out tracks.geojson --epsg 32632 --origin 500000,6000000',
         'sonar-imm export out map.geojson --map --epsg 32632 --origin 500000,6000000'))
-@click.argument('run', type=click.Path(path_type=Path, file_okay=False))
-@click.argument('out', type=click.Path(path_type=Path, dir_okay=False))
-@crs_option
-@origin_option
-@click.option('--cell', type=click.FloatRange(min=0.0, min_open=True), default=1.0,
+@click.argument('run', type=opt.FOLDER)
+@click.argument('out', type=opt.FILE)
+@opt.crs
+@opt.origin
+@click.option('--cell', type=opt.POSITIVE, default=1.0,
     show_default=True, help='Side of the cells of a grid, in metres.')
 @click.option('--segy', 'original', type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help='horizons: the SEG-Y file that the recording was converted from.')
 @click.option('--map', 'as_map', is_flag=True,
     help='obstacles: .geojson with those that are known at the end, in place of their tracks.')
 @click.option('--overwrite', is_flag=True, help='Replace OUT.')
-@json_option
+@opt.json
 def command(
     run: Path, out: Path, epsg: int | None, origin: tuple[float, float, float], cell: float,
     original: Path | None, as_map: bool, overwrite: bool, as_json: bool,
@@ -108,13 +109,7 @@ Told = tuple[dict[str, Any], str]
 
 def _export_soundings(asked: _Asked, cell: float) -> Told:
     from ..offline.run_folder import RUN
-    from ..recordings.export.points import (
-        origin_of,
-        read_points,
-        write_las,
-        write_table,
-        write_xyz,
-    )
+    from ..recordings.export import points as export
     from ..recordings.sources import BagError
     from ..survey.chart import chart_of, OF_ONE_RUN, write_geotiff
     from ..survey.line import budget_of, unstated, without_far
@@ -124,8 +119,8 @@ def _export_soundings(asked: _Asked, cell: float) -> Told:
             f'{asked.run} holds no soundings: the recording has no navigation, or is of another '
             'system'
         )
-    own = origin_of(asked.record, asked.run)
-    whole_run = read_points(place).placed(own, asked.epsg, asked.origin)
+    own = export.origin_of(asked.record, asked.run)
+    whole_run = export.read_points(place).placed(own, asked.epsg, asked.origin)
     points = without_far(whole_run)
     result: dict[str, Any] = {'soundings': len(points)}
     shape = ''
@@ -139,11 +134,11 @@ def _export_soundings(asked: _Asked, cell: float) -> Told:
                 result['assumed'] = missing
                 shape += f'; {RUN} does not state {", ".join(missing)}: default values'
         elif asked.kind == 'xyz':
-            write_xyz(unfinished, points)
+            export.write_xyz(unfinished, points)
         elif asked.kind == 'csv':
-            write_table(unfinished, points)
+            export.write_table(unfinished, points)
         else:
-            write_las(unfinished, points, asked.epsg)
+            export.write_las(unfinished, points, asked.epsg)
     if far := len(whole_run) - len(points):
         result['far'] = far
         shape += f'; {far} far away left out: no ship that sees the others can have seen them'
@@ -161,22 +156,19 @@ def _export_map(asked: _Asked) -> Told:
     if not landmarks:
         raise BagError(f'{asked.run} knows no obstacles at its end')
     if asked.epsg is None:
-        raise click.UsageError(
-            'places are in metres: say with --epsg and --origin where their origin lies'
-        )
+        why = 'places are in metres: say with --epsg and --origin where their origin lies'
+        raise click.UsageError(why)
     try:
         with whole(asked.out) as unfinished:
             write_obstacles(unfinished, landmarks, asked.epsg, asked.origin)
     except (KeyError, TypeError, ValueError):
-        raise BagError(
-            f"'landmarks' in the run.json of {asked.run} cannot be understood"
-        ) from None
+        why = f"'landmarks' in the run.json of {asked.run} cannot be understood"
+        raise BagError(why) from None
     return {'obstacles': len(landmarks)}, f'{len(landmarks)} obstacles'
 
 
 def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
-    """Longitude and latitude (n,) of places (n, 2 or 3) in metres from the origin; None where
-    nobody says it."""
+    """Longitude and latitude (n,) of places (n, 2 or 3) in metres; None where nobody says it."""
     if asked.epsg is None:
         return None
     import numpy as np
@@ -188,7 +180,6 @@ def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
 
 
 def _export_tracks(asked: _Asked) -> Told:
-    """Tracks of a run of divers or obstacles."""
     from ..evaluation.numbers import counted
     from ..recordings.export.points import origin_of
     from ..recordings.export.tracks import tracks_of, write_tracks
@@ -208,7 +199,6 @@ def _export_tracks(asked: _Asked) -> Told:
 
 
 def _export_horizons(asked: _Asked, original: Path | None) -> Told:
-    """Picks of a run of the fathometer."""
     from ..recordings.export.horizons import picks_of, write_geojson, write_horizons, write_picks
     from ..recordings.positions import navigation_topics, read_navigated, read_positions
     from ..recordings.reader import BagReader
@@ -221,9 +211,8 @@ def _export_horizons(asked: _Asked, original: Path | None) -> Told:
         raise BagError(f'{run} is of the fathometer: .{kind} is for tracks')
     segy = kind in ('sgy', 'segy', 'seg')
     if segy and original is None:
-        raise click.UsageError(
-            'SEG-Y needs --segy, the file that the recording was converted from'
-        )
+        why = 'SEG-Y needs --segy, the file that the recording was converted from'
+        raise click.UsageError(why)
     positions, notes, degrees = None, {}, _to_degrees(asked)
     if Path(record['bag']).exists():
         with BagReader(record['bag']) as bag:

@@ -18,14 +18,15 @@ import click
 
 from sonar_imm.trackers import SYSTEMS
 
-from .common import BAG, example, json_option, load_detector, print_json, progress, say
+from . import options as opt
+from .common import load_detector, print_json, progress, say
 
 
 # fmt: off
-@click.command(epilog=example('sonar-imm info dive.bag', 'sonar-imm info --json dive.mcap'))
-@click.argument('bag', type=BAG)
+@click.command(epilog=opt.example('sonar-imm info dive.bag', 'sonar-imm info --json dive.mcap'))
+@click.argument('bag', type=opt.PATH)
 @click.option('--strict', is_flag=True, help='Stop at the first damage instead of reading on.')
-@json_option
+@opt.json
 def command(bag: Path, strict: bool, as_json: bool) -> None:
     """Show what is in BAG, which tracker fits it and what is wrong with it.
 
@@ -33,13 +34,16 @@ def command(bag: Path, strict: bool, as_json: bool) -> None:
     no tracker can use it.
     """
     from ..offline.inspection import inspect
+    from ..recordings.own_files import own_parameters
     from ..recordings.reader import BagReader
     from ..recordings.topics import system_in_mind, types_heard
 
+    # What the parameter file beside a recording says of its images.
+    detector = load_detector(SYSTEMS['obstacle'], own_parameters(bag), {})
     with BagReader(bag, strict=strict) as reader:
         total = sum(topic.count for topic in reader.topics)
         with progress('reading', total, quiet=as_json) as advance:
-            found = inspect(reader, advance, _detector(bag))
+            found = inspect(reader, advance, detector)
         suits = any(topic['suits'] for topic in found['topics'])
         heard = '' if suits or not total else types_heard(system_in_mind(reader))
     print_json(found) if as_json else _print(found, heard)
@@ -48,21 +52,16 @@ def command(bag: Path, strict: bool, as_json: bool) -> None:
 # fmt: on
 
 
-def _detector(bag: Path) -> dict[str, Any]:
-    """What the parameter file beside a recording says of its images."""
-    from ..recordings.own_files import own_parameters
-
-    return load_detector(SYSTEMS['obstacle'], own_parameters(bag), {})
-
-
 def _print(found: dict[str, Any], heard: str) -> None:
     say(f'{found["bag"]}: {found["messages"]} messages in {found["duration_s"]:.1f} s')
     for topic in found['topics']:
         rate = f', {topic["rate_hz"]:.3g} Hz' if topic['rate_hz'] else ''
+        scans = topic['scans'] or {'most': 0, 'count': 0}
+        several = f', {scans["count"]} scans, up to {scans["most"]} per scan'
         frames = f', frame {", ".join(topic["frames"])}' if any(topic['frames']) else ''
         say(
             f'  {topic["name"]}  {topic["type"]}  {topic["count"]} messages{rate}'
-            f'{_scans(topic["scans"])}{frames}'
+            f'{several if scans["most"] > 1 else ""}{frames}'
         )
         for suited in topic['suits']:
             say(f'      fits {suited}')
@@ -78,12 +77,6 @@ def _print(found: dict[str, Any], heard: str) -> None:
         images = any(topic['type'].endswith('SonarImage') for topic in found['topics'])
         hint = '; of amplitude and phase sonar-imm convert interferometer makes snapshots'
         say('no tracker can use it' + (hint if images else heard))
-
-
-def _scans(scans: dict[str, int] | None) -> str:
-    if scans is None or scans['most'] <= 1:
-        return ''
-    return f', {scans["count"]} scans, up to {scans["most"]} per scan'
 
 
 def track_line(bag: str, system: str, named: dict[str, str], missing: Sequence[str] = ()) -> str:

@@ -15,7 +15,8 @@ from typing import Any
 
 import click
 
-from .common import BAG, example, progress, say
+from . import options as opt
+from .common import progress, say
 
 
 class ManyWords(click.Command):
@@ -40,21 +41,22 @@ class ManyWords(click.Command):
 
 # fmt: off
 @click.command(cls=ManyWords,
-    epilog=example('sonar-imm play dive.bag --clock', 'sonar-imm play dive.bag --lockstep /diver',
+    epilog=opt.example('sonar-imm play dive.bag --clock',
+        'sonar-imm play dive.bag --lockstep /diver',
         'sonar-imm play dive.bag --remap /usbl/pose:=/fix --rate 5'))
-@click.argument('bag', type=BAG)
-@click.option('-r', '--rate', type=click.FloatRange(min=0.0, min_open=True), default=1.0,
+@click.argument('bag', type=opt.PATH)
+@click.option('-r', '--rate', type=opt.POSITIVE, default=1.0,
     show_default=True, help='Speed: 2 is twice as fast.')
 @click.option('-l', '--loop', is_flag=True, help='Start over at the end, until Ctrl-C.')
-@click.option('--start-offset', type=click.FloatRange(min=0.0), default=0.0, metavar='SECONDS',
+@click.option('--start-offset', type=opt.NOT_NEGATIVE, default=0.0, metavar='SECONDS',
     help='Skip so much of the recording.')
 @click.option('--playback-duration', type=float, default=-1.0, metavar='SECONDS',
     help='Play so much of the recording; negative, the default: to its end.')
-@click.option('-d', '--delay', type=click.FloatRange(min=0.0), default=0.0, metavar='SECONDS',
+@click.option('-d', '--delay', type=opt.NOT_NEGATIVE, default=0.0, metavar='SECONDS',
     help='Wait before the first message.')
 @click.option('-p', '--start-paused', is_flag=True,
     help='Wait for the service /sonar_imm_player/resume.')
-@click.option('--clock', type=click.FloatRange(min=0.0, min_open=True), is_flag=False,
+@click.option('--clock', type=opt.POSITIVE, is_flag=False,
     flag_value=40.0, default=None, metavar='[HZ]', help='Publish /clock, at 40 Hz by default.')
 @click.option('--topics', multiple=True, metavar='TOPIC...', help='Only these topics.')
 @click.option('--exclude-topics', multiple=True, metavar='TOPIC...', help='Not these topics.')

@@ -20,7 +20,8 @@ from msg_adapters.inputs import FEEDERS
 from sonar_imm import __version__
 from sonar_imm.trackers import SYSTEMS
 
-from .common import by_topic, example, json_option, print_json, say, set_option, typed_overrides
+from . import options as opt
+from .common import by_topic, print_json, say, typed_overrides
 
 SURVEY, SURVEY_SCENES = 'survey', 'sonar_imm_tools.simulation.survey'
 """Not a system: lines of soundings over one floor."""
@@ -28,21 +29,21 @@ SURVEY, SURVEY_SCENES = 'survey', 'sonar_imm_tools.simulation.survey'
 
 # fmt: off
 @click.command(
-    epilog=example('sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
+    epilog=opt.example('sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
         'sonar-imm simulate diver --list',
         'sonar-imm simulate survey out --soundings --set lines=5'))
 @click.argument('system', type=click.Choice([*SYSTEMS, SURVEY]))
-@click.argument('out_bag', type=click.Path(path_type=Path), required=False)
+@click.argument('out_bag', type=opt.PATH, required=False)
 @click.option('--scenario', default=None, help='Name of the scene; by default the first one.')
 @click.option('--seed', type=click.IntRange(min=0), default=0, show_default=True,
     help='The same scenario and seed give the same bag.')
-@set_option
+@opt.overrides
 @click.option('--soundings', is_flag=True,
     help='survey: folders of soundings, as `survey` reads them.')
 @click.option('--compress', is_flag=True, help='Compress the bag: pressure takes a third.')
 @click.option('--list', 'list_scenarios', is_flag=True,
     help='Only list scenarios and what --set can change.')
-@json_option
+@opt.json
 def command(
     system: str, out_bag: Path | None, scenario: str | None, seed: int, overrides: dict[str, str],
     soundings: bool, compress: bool, list_scenarios: bool, as_json: bool,
@@ -60,48 +61,40 @@ def command(
         return
     if out_bag is None:
         raise click.UsageError("Missing argument 'OUT_BAG'")
+    name = scenario or next(iter(scenes.SCENARIOS))
+    config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     if system == SURVEY:
-        _simulate_survey(scenes, out_bag, scenario, seed, overrides, soundings, compress, as_json)
+        result, text = _simulate_survey(scenes, config, name, out_bag, seed, soundings, compress)
+        print_json(result) if as_json else say(text)
         return
     from sonar_imm.truth import TrueTrack
 
     from ..recordings.own_files import own_parameters, unusual
     from ..recordings.truth import write_scene
 
-    name = scenario or next(iter(scenes.SCENARIOS))
-    config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     scene = scenes.simulate(config, seed)
     known = unusual(config.instruments(), SYSTEMS[system].config_type())
     sections = {system: known}
     if fed := config.feeder_instruments():
         # A scene writes its images as the only type that needs no further package.
         sections[FEEDERS[system]] = {'input_types': ['image=sensor_msgs/msg/Image'], **fed}
-    report = write_scene(
-        scene,
-        out_bag,
-        compressed=compress,
-        parameters=sections,
-        provenance={
-            'source': f'simulated: {system} {name}',
-            'seed': str(seed),
-            'sonar_imm': __version__,
-            **{f'set {key}': value for key, value in sorted(overrides.items())},
-        },
-    )
+    notes = {'source': f'simulated: {system} {name}', 'seed': str(seed), 'sonar_imm': __version__}
+    notes |= {f'set {key}': value for key, value in sorted(overrides.items())}
+    made = write_scene(scene, out_bag, compressed=compress, parameters=sections, provenance=notes)
     parameters = own_parameters(out_bag)
     targets = sum(isinstance(true, TrueTrack) for true in scene.truth)
     result = {
         'bag': str(out_bag),
         'scenario': name,
         'seed': seed,
-        'messages': report.messages,
+        'messages': made.messages,
         'targets': targets,
         'parameters': known,
     }
     if as_json:
         print_json(result)
         return
-    what = by_topic(report.messages)
+    what = by_topic(made.messages)
     say(f'{out_bag}: {what} ({name}, seed {seed}' + (f', {targets} targets)' if targets else ')'))
     if parameters:
         say(f'  parameters of the instruments, for the tracker: {parameters}')
@@ -109,16 +102,9 @@ def command(
 
 
 def _simulate_survey(
-    scenes: Any,
-    out: Path,
-    scenario: str | None,
-    seed: int,
-    overrides: dict[str, str],
-    soundings: bool,
-    compress: bool,
-    as_json: bool,
-) -> None:
-    """Folders of lines, or bags, and truth.npz."""
+    scenes: Any, config: Any, name: str, out: Path, seed: int, soundings: bool, compress: bool
+) -> tuple[dict[str, Any], str]:
+    """Folders of lines, or bags, and truth.npz; what was made, as JSON and in words."""
     from sonar_imm.files import whole
 
     from ..recordings.export.points import write_table
@@ -126,8 +112,6 @@ def _simulate_survey(
     from ..recordings.sources import BagError
     from ..recordings.truth import write_scene
 
-    name = scenario or next(iter(scenes.SCENARIOS))
-    config = scenes.scenario(name, typed_overrides(scenes.SurveyScenario, overrides))
     if out.exists():
         raise BagError(f'{out} is there already; choose another folder')
     system, what, total = 'bathymetry', 'soundings' if soundings else 'messages', 0
@@ -151,20 +135,16 @@ def _simulate_survey(
                 total += sum(report.messages.values())
         scenes.write_truth(folder / 'truth.npz', scene)
     result = {'out': str(out), 'scenario': name, 'seed': seed, 'lines': len(scene.names)}
-    result[what] = total
-    if as_json:
-        print_json(result)
-    else:
-        say(f'{out}: {len(scene.names)} lines, {total} {what} ({name}, seed {seed})')
+    text = f'{out}: {len(scene.names)} lines, {total} {what} ({name}, seed {seed})'
+    return {**result, what: total}, text
 
 
 def _list(scenes: Any, as_json: bool) -> None:
     described = {name: entry[0] for name, entry in scenes.SCENARIOS.items()}
     specs = type(scenes.scenario(next(iter(described)))).specs()
     if as_json:
-        print_json(
-            {'scenarios': described, 'parameters': {spec.name: spec.description for spec in specs}}
-        )
+        parameters = {spec.name: spec.description for spec in specs}
+        print_json({'scenarios': described, 'parameters': parameters})
         return
     for name, description in described.items():
         say(f'{name:<20} {description}')

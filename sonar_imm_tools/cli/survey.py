@@ -17,17 +17,8 @@ from pathlib import Path
 import click
 
 from ..evaluation.numbers import counted
-from .common import (
-    crs_option,
-    example,
-    jobs_option,
-    json_option,
-    origin_option,
-    print_json,
-    progress,
-    say,
-    warn,
-)
+from . import options as opt
+from .common import print_json, progress, say, warn
 
 
 def _resolution(_ctx: click.Context, _param: click.Parameter, value: str) -> float:
@@ -44,24 +35,24 @@ def _resolution(_ctx: click.Context, _param: click.Parameter, value: str) -> flo
 
 # fmt: off
 @click.command(
-    epilog=example('sonar-imm survey runs chart --adjust --crs 32632 --origin 500000,6000000',
+    epilog=opt.example('sonar-imm survey runs chart --adjust --crs 32632 --origin 500000,6000000',
         'sonar-imm survey runs chart --adjust --jobs 8 --resume',
         'sonar-imm survey runs chart --resolution 0.5 --scheduler tcp://10.0.0.5:8786'))
-@click.argument('runs', type=click.Path(path_type=Path))
-@click.argument('out', type=click.Path(path_type=Path))
+@click.argument('runs', type=opt.PATH)
+@click.argument('out', type=opt.PATH)
 @click.option('--resolution', default='auto', show_default=True, callback=_resolution,
     metavar='auto|M', help='Side of the cells in metres; auto: a twentieth of the depth, by tile.')
 @click.option('--adjust', 'adjusted', is_flag=True, help='Adjust the lines where they cross.')
 @click.option('--fix', 'fixed', metavar='LINE', multiple=True, help='A line whose tide is known.')
-@crs_option
-@origin_option
-@jobs_option(help='Processes.')
+@opt.crs
+@opt.origin
+@opt.jobs(help='Processes.')
 @click.option('--scheduler', metavar='ADDRESS',
     help='Do the jobs on the cluster of this dask scheduler instead; its workers need the same '
     'sonar_imm, and reach RUNS and OUT by the same paths.')
 @click.option('--resume', is_flag=True, help='Keep in OUT what is the same as before.')
 @click.option('--overwrite', is_flag=True, help='Replace OUT.')
-@json_option
+@opt.json
 def command(
     runs: Path, out: Path, resolution: float, adjusted: bool, fixed: tuple[str, ...],
     epsg: int | None, origin: tuple[float, float, float], jobs: int, scheduler: str | None,

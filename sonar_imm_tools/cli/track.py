@@ -21,23 +21,8 @@ import click
 
 from sonar_imm.trackers import System, SYSTEMS
 
-from .common import (
-    BAG,
-    example,
-    jobs_option,
-    json_option,
-    load_config,
-    load_detector,
-    parameters_taken,
-    params_option,
-    print_json,
-    progress,
-    say,
-    set_option,
-    system_option,
-    topic_option,
-    warn,
-)
+from . import options as opt
+from .common import load_config, load_detector, parameters_taken, print_json, progress, say, warn
 
 if TYPE_CHECKING:
     from sonar_imm.acoustics.geodesy import Origin
@@ -48,9 +33,7 @@ if TYPE_CHECKING:
     from ..recordings.reader import BagReader
 
 
-def _shard(
-    _ctx: click.Context, _param: click.Parameter, value: str | None
-) -> tuple[int, int] | None:
+def _shard(_ctx: Any, _param: Any, value: str | None) -> tuple[int, int] | None:
     if value is None:
         return None
     numbers = value.split('/')
@@ -63,29 +46,29 @@ def _shard(
 
 # fmt: off
 @click.command(
-    epilog=example('sonar-imm track dive.bag out',
+    epilog=opt.example('sonar-imm track dive.bag out',
         'sonar-imm track dive.bag out --set model_set=heading_speed',
         'sonar-imm track dive.bag out --topic fix=/usbl/pose --params my_diver.yaml',
         'sonar-imm track line1.bag line2.bag line3.bag out --jobs 3 --parquet',
         'sonar-imm track /survey/*.bag /survey/out --scheduler tcp://10.0.0.5:8786',
         'sonar-imm track /survey/*.bag /survey/out --shard '
         '$SLURM_ARRAY_TASK_ID/$SLURM_ARRAY_TASK_COUNT'))
-@click.argument('bags', metavar='BAG...', nargs=-1, type=BAG)
-@click.argument('out_dir', metavar='OUT_DIR', required=False, type=click.Path(path_type=Path))
-@system_option
-@params_option('Parameter file: ROS 2 form or a plain mapping.')
-@set_option
-@topic_option
+@click.argument('bags', metavar='BAG...', nargs=-1, type=opt.PATH)
+@click.argument('out_dir', metavar='OUT_DIR', required=False, type=opt.PATH)
+@opt.system
+@opt.params(help='Parameter file: ROS 2 form or a plain mapping.')
+@opt.overrides
+@opt.topics
 @click.option('--order', type=click.Choice(['recorded', 'stamp']), default='recorded',
     show_default=True, help='Messages in the order of arrival, or sorted by their stamps.')
-@click.option('--sound-speed', type=click.Path(path_type=Path), metavar='FILE',
+@click.option('--sound-speed', type=opt.PATH, metavar='FILE',
     help='Profile of sound speed (CARIS .svp, Kongsberg .asvp, Sea-Bird .cnv, CSV): rays of '
     'bathymetry bend by it, other systems take its mean.')
-@click.option('--initial', metavar='FILE', type=click.Path(path_type=Path),
+@click.option('--initial', metavar='FILE', type=opt.PATH,
     help='Where divers are at first, as the topic initial says it: YAML or JSON with position and '
     'covariance, and if wanted name, time, frame_id.')
 @click.option('--smooth', is_flag=True, help='Condition each estimate on later measurements too.')
-@jobs_option(
+@opt.jobs(
     help='Processes: for several runs, or for the pings of one where no ping needs another '
     '(bathymetry). The estimates do not depend on it.')
 @click.option('--scheduler', metavar='ADDRESS',
@@ -100,7 +83,7 @@ def _shard(
 @click.option('--no-table', is_flag=True, help='Write no tables: the bag has all of it.')
 @click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')
 @click.option('--strict', is_flag=True, help='Stop at the first damage in BAG.')
-@json_option
+@opt.json
 def command(
     bags: tuple[Path, ...], out_dir: Path | None, jobs: int, scheduler: str | None,
     shard: tuple[int, int] | None, parquet: bool, no_table: bool, as_json: bool, **options: Any,
@@ -126,32 +109,27 @@ def command(
         raise click.UsageError('--jobs and --scheduler exclude each other')
     if parquet and no_table:
         raise click.UsageError('--parquet and --no-table exclude each other')
-    from ..offline.run_folder import (
-        AS_CSV,
-        AS_PARQUET,
-        NO_TABLE,
-        require_parquet,
-        SHARD_SUMMARY,
-        SUMMARY,
-    )
+    from ..offline import run_folder as results
 
     if parquet:
-        require_parquet()
-    tables = AS_PARQUET if parquet else NO_TABLE if no_table else AS_CSV
+        results.require_parquet()
+    tables = results.NO_TABLE if no_table else results.AS_CSV
+    tables = results.AS_PARQUET if parquet else tables
     plan = Plan(tables=tables, **options)
     if len(bags) == 1 and shard is None:
         runs = plan.jobs(bags[0], out_dir, lambda sentence: say(sentence, quiet=as_json))
         say_parameters(bags[0], plan, quiet=as_json)
         if len(runs) == 1 and scheduler is None:
             run = track_one(evolve(runs[0], options=evolve(runs[0].options, jobs=jobs)), as_json)
-            print_json(run) if as_json else _print(run, out_dir)
-            if _is_useless(run):
+            useless = not run['estimates'] and not run['counts'].get('used', 0)
+            print_json(run) if as_json else _print(run, out_dir, useless)
+            if useless:
                 raise click.exceptions.Exit(1)
             return
         failures: list[Outcome] = []
     else:
         runs, failures = _of_all(plan, bags, out_dir, shard or (1, 1))
-    summary = SUMMARY if shard is None else SHARD_SUMMARY.format(*shard)
+    summary = results.SUMMARY if shard is None else results.SHARD_SUMMARY.format(*shard)
     _track_all(runs, failures, out_dir, summary, jobs, scheduler, as_json)
 # fmt: on
 
@@ -276,8 +254,7 @@ def say_parameters(bag: Path, plan: Plan, *, quiet: bool = False) -> None:
 def _of_all(
     plan: Plan, bags: Sequence[Path], out_dir: Path, shard: tuple[int, int]
 ) -> tuple[list[Job], list[Outcome]]:
-    """The runs that a share of `bags` takes, in the order of their paths, and what cannot be a
-    run."""
+    """The runs of a share of `bags`, in the order of their paths, and what cannot be a run."""
     from sonar_imm.parameters import ConfigError
 
     from ..offline.batch import Outcome
@@ -309,8 +286,8 @@ def _track_all(
     as_json: bool,
 ) -> None:
     """Do all runs, write and print their summary; ends with 1 when one failed."""
-    from ..offline.batch import check_summary, run_jobs, summary_of, write_summary
-    from ..offline.run_folder import RUN
+    from ..offline.batch import check_summary, run_jobs, summary_of
+    from ..offline.run_folder import RUN, RunFolder
     from ..recordings.reader import BagError
 
     if (out_dir / RUN).exists() and runs and runs[0].folder != out_dir:
@@ -329,10 +306,9 @@ def _track_all(
                 warn(f'{name}: {outcome.failure}')
             outcomes.append(outcome)
             advance(1)
-    content = summary_of(
-        out_dir, sorted(outcomes, key=lambda item: (str(item.bag), item.instrument)), summary
-    )
-    write_summary(out_dir, content, summary)
+    outcomes.sort(key=lambda item: (str(item.bag), item.instrument))
+    content = summary_of(out_dir, outcomes, summary)
+    RunFolder(out_dir).write_json(summary, content)
     print_json(content) if as_json else _print_summary(content, out_dir)
     if any(outcome.failure for outcome in outcomes):
         raise click.exceptions.Exit(1)
@@ -353,12 +329,8 @@ def choose_system(
         inputs = {*(topics or {}).values()}
         meant = [system for system in SYSTEMS if inputs and knows_inputs(system, inputs)]
         fits = fitting_systems(reader)
-        best = (
-            [system for system in fits if system in meant]
-            or meant
-            or fits
-            or [system_in_mind(reader)]
-        )
+        both = [system for system in fits if system in meant]
+        best = both or meant or fits or [system_in_mind(reader)]
         instruments(reader, best[0], topics)
     return SYSTEMS[found[0]]
 
@@ -368,21 +340,16 @@ def track_one(job: Job, quiet: bool = False) -> dict[str, Any]:
     from ..offline.batch import track
 
     with contextlib.ExitStack() as stack:
-        outcome = track(
-            job,
-            lambda total: stack.enter_context(
-                progress('tracking', total, quiet=quiet, first='loading kernels')
-            ),
-        )
+
+        def begin(total: int) -> Callable[[int], None]:
+            bar = progress('tracking', total, quiet=quiet, first='loading kernels')
+            return stack.enter_context(bar)
+
+        outcome = track(job, begin)
     return dict(outcome.run or {})
 
 
-def _is_useless(run: Mapping[str, Any]) -> bool:
-    """Return whether no measurement was used."""
-    return not run['estimates'] and not run['counts'].get('used', 0)
-
-
-def _print(run: Mapping[str, Any], out_dir: Path) -> None:
+def _print(run: Mapping[str, Any], out_dir: Path, useless: bool) -> None:
     say(
         f'{run["messages"]} messages read, {run["estimates"]} estimates with {run["rows"]} rows '
         f'written to {out_dir}'
@@ -398,7 +365,7 @@ def _print(run: Mapping[str, Any], out_dir: Path) -> None:
         f'  {run["bag_bytes"] * 1e-6:.3g} MB read at {run["timings"]["mb_per_s"]:.3g} MB/s, '
         f'{run["written_bytes"] * 1e-6:.3g} MB written'
     )
-    if _is_useless(run):
+    if useless:
         say('  no measurement was used')
     if run['rows'] == 0:
         say('  no track was made; sonar-imm info may show why')

@@ -13,47 +13,35 @@ from __future__ import annotations
 import os
 from pathlib import Path
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from attrs import asdict
 import click
 
-from .common import (
-    BAG,
-    example,
-    jobs_option,
-    json_option,
-    params_option,
-    print_json,
-    progress,
-    say,
-    set_option,
-    system_option,
-    topic_option,
-)
-from .track import Plan, say_parameters
+from sonar_imm.trackers import SYSTEMS
 
-if TYPE_CHECKING:
-    from ..evaluation.tuning import Fitting
+from . import options as opt
+from .common import parameters_taken, print_json, progress, say, typed_overrides
+from .track import Plan, say_parameters
 
 
 # fmt: off
 @click.command(
-    epilog=example('sonar-imm tune dive.bag --system diver',
+    epilog=opt.example('sonar-imm tune dive.bag --system diver',
         'sonar-imm tune dive1.bag dive2.bag --out tuned.yaml --jobs 2',
         'sonar-imm tune survey.bag --parameters range_std,detection_probability --json',
         'sonar-imm track dive.bag out --params tuned.yaml'))
-@click.argument('bags', metavar='BAG...', nargs=-1, required=True, type=BAG)
-@system_option
+@click.argument('bags', metavar='BAG...', nargs=-1, required=True, type=opt.PATH)
+@opt.system
 @click.option('--parameters', metavar='NAME,...',
     help='Parameters to fit; default: those that bags of the system can determine.')
-@click.option('--out', type=click.Path(path_type=Path, dir_okay=False),
+@click.option('--out', type=opt.FILE,
     help='Write the parameters here, for `track --params` and the nodes.')
-@params_option('Parameter file to begin with: ROS 2 form or a plain mapping.')
-@set_option
-@topic_option
-@jobs_option(help='Processes that share the fits. The result does not depend on it.')
-@json_option
+@opt.params(help='Parameter file to begin with: ROS 2 form or a plain mapping.')
+@opt.overrides
+@opt.topics
+@opt.jobs(help='Processes that share the fits. The result does not depend on it.')
+@opt.json
 def command(
     bags: tuple[Path, ...], parameters: str | None, out: Path | None, jobs: int, as_json: bool,
     **options: Any,
@@ -94,9 +82,14 @@ def command(
     with progress('tuning', most, quiet=as_json) as advance:
         found = tune(fitting, measurements, processes_used=jobs, advance=advance)
     if out is not None:
-        stated = _begun_with(plan, bags[0], runs[0].system)
-        head = f'# Fitted by sonar-imm tune: {", ".join(found.values) or "no parameter"}.\n'
-        values = found.values or _configured(fitting)
+        # Those of --params, --set and the bag's own file, then what was fitted.
+        system, values = SYSTEMS[runs[0].system], found.values
+        stated = parameters_taken(system, plan.parameters_of(bags[0]))
+        stated |= typed_overrides(system.config_type(), plan.overrides)
+        head = f'# Fitted by sonar-imm tune: {", ".join(values) or "no parameter"}.\n'
+        if not values:  # as they are configured, without empty lists
+            values = {t.name: getattr(fitting.jobs[0].config, t.name) for t in fitting.tunables}
+            values = {name: value for name, value in values.items() if value != ()}
         write_ros_parameters(out, {'/**': {**stated, **values}}, head)
     if as_json:
         content = asdict(found)
@@ -124,19 +117,3 @@ def command(
     elif out is not None:
         say(f'written to {out}')
 # fmt: on
-
-
-def _configured(fitting: Fitting) -> dict[str, Any]:
-    """Return the parameters that were fitted as they are configured, without empty lists."""
-    values = {t.name: getattr(fitting.jobs[0].config, t.name) for t in fitting.tunables}
-    return {name: value for name, value in values.items() if value != ()}
-
-
-def _begun_with(plan: Plan, bag: Path, system: str) -> dict[str, Any]:
-    """Return the parameters of --params, --set and the bag's own file."""
-    from sonar_imm.trackers import SYSTEMS
-
-    from .common import parameters_taken, typed_overrides
-
-    stated = parameters_taken(SYSTEMS[system], plan.parameters_of(bag))
-    return {**stated, **typed_overrides(SYSTEMS[system].config_type(), plan.overrides)}

@@ -18,17 +18,18 @@ import tempfile
 
 import click
 
-from .common import BAG, example, Renewed, say
+from . import options as opt
+from .common import say
 
 
 # fmt: off
-@click.command(cls=Renewed,
-    epilog=example('sonar-imm view out', 'sonar-imm view dive.bag',
+@click.command(cls=opt.Renewed,
+    epilog=opt.example('sonar-imm view out', 'sonar-imm view dive.bag',
         'sonar-imm view out --rerun out.rrd'))
-@click.argument('source', metavar='RESULTS|BAG', type=BAG)
+@click.argument('source', metavar='RESULTS|BAG', type=opt.PATH)
 @click.option('--browser', is_flag=True, hidden=True, expose_value=False)  # the only way now
 @click.option('--rerun', 'rerun_file', metavar='FILE.rrd',
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=opt.FILE,
     help='Write the estimates of RESULTS for the Rerun viewer instead.')
 def command(source: Path, rerun_file: Path | None) -> None:
     """Open the HTML report of RESULTS, a folder of `sonar-imm track`, in the browser.
@@ -36,34 +37,24 @@ def command(source: Path, rerun_file: Path | None) -> None:
     A report that is missing is written first. A BAG is tracked and scored first, into a temporary
     folder. Without a browser the command only says where the report is.
     """
-    if rerun_file is None:
-        _open_report(source)
+    if rerun_file is not None:
+        from ..evaluation.rerun_file import write_rerun
+        from ..offline.run_folder import RunFolder
+
+        RunFolder(source).keep_from(rerun_file)
+        count = write_rerun(source, rerun_file)
+        say(f'{count} estimates written to {rerun_file}; show them with: rerun {rerun_file}')
         return
-    from ..evaluation.rerun_file import write_rerun
-    from ..offline.run_folder import RunFolder
-
-    RunFolder(source).keep_from(rerun_file)
-    count = write_rerun(source, rerun_file)
-    say(f'{count} estimates written to {rerun_file}; show them with: rerun {rerun_file}')
-# fmt: on
-
-
-def _open_report(source: Path) -> None:
     import webbrowser
 
     report = _report_of(source).resolve()
     say(f'report: {report}')
-    if _has_screen():
+    # Without a screen a browser of the terminal would start, which cannot draw the report.
+    screens = ('DISPLAY', 'WAYLAND_DISPLAY', 'BROWSER')
+    if not sys.platform.startswith('linux') or any(os.environ.get(name) for name in screens):
         with contextlib.suppress(webbrowser.Error):
             webbrowser.open(report.as_uri())
-
-
-def _has_screen() -> bool:
-    """Whether a browser can open a window. On a machine without a screen `webbrowser` would start
-    a browser of the terminal, which cannot draw the report."""
-    if not sys.platform.startswith('linux'):
-        return True
-    return any(os.environ.get(name) for name in ('DISPLAY', 'WAYLAND_DISPLAY', 'BROWSER'))
+# fmt: on
 
 
 def _report_of(source: Path) -> Path:

@@ -16,15 +16,16 @@ import click
 
 from sonar_imm.trackers import SYSTEMS
 
-from .common import example, load_config, params_option, Renewed, say, set_option
+from . import options as opt
+from .common import load_config, say
 
 
 # fmt: off
-@click.command(cls=Renewed,
-    epilog=example('sonar-imm warm', 'sonar-imm warm fathometer --set heave=memory'))
-@click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
-@params_option('ROS 2 parameter file of the tracker; with exactly one system.')
-@set_option
+@click.command(cls=opt.Renewed,
+    epilog=opt.example('sonar-imm warm', 'sonar-imm warm fathometer --set heave=memory'))
+@opt.systems
+@opt.params(help='ROS 2 parameter file of the tracker; with exactly one system.')
+@opt.overrides
 def command(systems: tuple[str, ...], params: Path | None, overrides: dict[str, str]) -> None:
     """Compile the kernels of the trackers, all of them by default.
 

@@ -19,6 +19,7 @@ for all columns that begin like it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from itertools import product
 from typing import Any, TypeVar
 
 from attrs import evolve, field, fields, frozen
@@ -26,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_imm.estimates import Estimate
-from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.estimation.arrays import FloatArray, IndexArray, IntArray
 
 from ..recordings.sources import BagError
 
@@ -55,13 +56,10 @@ class _Columns:
             return np.asarray(table.get(plain, np.full(rows, self.default)), self.dtype)
 
         if self.prefix:
-            pairs = [
-                (a, b) if i <= j else (b, a)
-                for i, a in enumerate(self.names)
-                for j, b in enumerate(self.names)
-            ]
+            order = {name: place for place, name in enumerate(self.names)}
+            pairs = (sorted(pair, key=order.__getitem__) for pair in product(self.names, repeat=2))
             flat = [values(f'{self.prefix}_{a}_{b}?') for a, b in pairs]
-            return np.column_stack(flat).reshape(rows, len(self.names), len(self.names))
+            return np.column_stack(flat).reshape(rows, len(order), len(order))
         if self.names[0].endswith('*'):
             found = [values(name) for name in table if name.startswith(self.names[0][:-1])]
             return np.column_stack(found or [np.empty((rows, 0))])
@@ -76,8 +74,7 @@ def column(*names: str, dtype: type = np.float64, default: float = np.nan) -> An
 
 
 def covariance_of(*names: str, prefix: str = 'cov') -> Any:
-    """A field (n, k, k) read from the upper triangle ``<prefix>_<a>_<b>`` of k `names`; NaN where
-    a column is missing."""
+    """A field (n, k, k) of the upper triangle ``<prefix>_<a>_<b>`` of `names`; NaN if missing."""
     return field(metadata={_COLUMNS: _Columns(names, prefix=prefix)})
 
 
@@ -98,6 +95,11 @@ class Rows:
         """The same run with some of its rows (a mask, indices or a slice); `scan_ns` is kept."""
         names = ('stamp_ns', *_declared(type(self)))
         return evolve(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def spans(self, stamp_ns: IntArray) -> tuple[IndexArray, IndexArray]:
+        """First row (m,) of each stamp (m,), and one behind the last (m,)."""
+        first = np.searchsorted(self.stamp_ns, stamp_ns, side='left')
+        return first, np.searchsorted(self.stamp_ns, stamp_ns, side='right')
 
     def by_track(self: R) -> Iterator[tuple[int, R]]:
         """The rows of each ``track_id``; of several with one stamp the last counts."""
@@ -130,14 +132,10 @@ def read_rows(kind: type[R], estimates: Iterable[Estimate], missing: str, **furt
 def read_columns(table: Estimate, names: Iterable[str], missing: str) -> dict[str, FloatArray]:
     """The columns `names` of one table, each (n,). Raises `MissingColumn` as `read_rows` does."""
     columns = table.columns()
-    return {
-        name.rstrip('?'): _Columns((name,)).read(columns, len(table), missing) for name in names
-    }
+    read = {name.rstrip('?'): _Columns((name,)).read for name in names}
+    return {name: values(columns, len(table), missing) for name, values in read.items()}
 
 
 def _declared(kind: type[Rows]) -> dict[str, _Columns]:
-    return {
-        entry.name: entry.metadata[_COLUMNS]
-        for entry in fields(kind)
-        if _COLUMNS in entry.metadata
-    }
+    declared = (entry for entry in fields(kind) if _COLUMNS in entry.metadata)
+    return {entry.name: entry.metadata[_COLUMNS] for entry in declared}

@@ -9,31 +9,28 @@
 """Judges: scores and summaries of finished runs, one judge per system.
 
 The metrics of a diver track and of a sea floor differ. So each system has a module that judges its
-runs, `System.judge`, which provides
-
-- ``scored(folder, run, options)``: reads the estimates and the truth and scores them;
-- ``METRICS``, ``SEEN`` and ``summary_sentence``: how people see the scores;
-- ``LIMIT`` and ``REMARK``: the `Limit` of the error for the shipped recordings, and what is said
-  beside the error.
-
-Everything else is the same for all of them: the folder of a run, the page, the commands.
+runs, `System.judge`, which is a `Judge`, and beside it ``figures``, whose ``sections`` show the
+scores. Everything else is the same for all of them: how a run and its truth are read (`Case`), the
+page, the commands.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-import contextlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import functools
 from importlib import import_module
 import math
 from pathlib import Path
-from typing import Any, Protocol, TYPE_CHECKING
+from typing import Any, Protocol, TYPE_CHECKING, TypeVar
 
 from attrs import frozen
 
+from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.estimates import Estimate
+from sonar_imm.parameters import Config
 from sonar_imm.trackers import SYSTEMS
 
-from ..offline.run_folder import RunFolder
+from ..offline.run_folder import read_measurements, read_truth, RunFolder
 from ..recordings.sources import BagError
 from .numbers import Card, cards, Check, fill, front, lines, look_up, Metric, Text, verdict
 
@@ -41,6 +38,8 @@ if TYPE_CHECKING:  # it loads plotly, which only a report needs and which takes 
     from .report import Part, Section
 
 TRUTH_GAP = 60.0
+T = TypeVar('T')
+C = TypeVar('C', bound=Config)
 
 
 @frozen
@@ -137,13 +136,49 @@ class Judgement:
         )
 
 
-Scored = tuple[dict[str, Any], 'Callable[[], Iterable[Section]]']
-"""Metrics of a run, and what makes the sections of its report."""
+@frozen(eq=False)
+class Case:
+    """A run that is to be judged: its folder, the content of ``run.json``, and what it is compared
+    with. What cannot be read, or is of another system, raises `BagError` that names the file."""
+
+    folder: RunFolder
+    run: Mapping[str, Any]
+    options: JudgeOptions
+
+    def estimates(self, read: Callable[[list[Estimate]], T]) -> T:
+        """What `read` makes of the estimates."""
+        return self._read(read, self.folder.read_estimates(), self.folder.path)
+
+    def truth(self, read: Callable[[list[Estimate]], T]) -> T | None:
+        """What `read` makes of the truth; None where there is none."""
+        tables = read_truth(self.run, self.options.truth_bag)
+        place = self.options.truth_bag or Path(self.run['bag'])
+        return None if tables is None else self._read(read, tables, place)
+
+    def measurements(self) -> Iterable[Any]:
+        """What was tracked, in the order recorded; nothing when the recording is gone."""
+        return read_measurements(self.run)
+
+    def config(self, kind: type[C]) -> C:
+        """The parameters of the tracker."""
+        return kind.from_mapping(self.run['parameters'], ignore_unknown=True)
+
+    def origin(self) -> Origin | None:
+        """Where the frame of the tracks lies on Earth, None when only the parameters may say."""
+        return Origin(**self.run['origin']) if self.run.get('origin') else None
+
+    @staticmethod
+    def _read(read: Callable[[list[Estimate]], T], tables: list[Estimate], place: Path) -> T:
+        try:
+            return read(tables)
+        except ValueError as error:
+            raise BagError(f'{place}: {error}') from None
 
 
 class Judge(Protocol):
-    """What the module `System.judge` provides; REMARK follows the error where it is checked, SEEN
-    says what was tracked."""
+    """What the module `System.judge` provides. LIMIT: of the error for the shipped recordings;
+    REMARK follows the error where it is checked; METRICS: how people see the scores; SEEN says
+    what was tracked."""
 
     LIMIT: Limit
     METRICS: Sequence[Metric]
@@ -154,23 +189,25 @@ class Judge(Protocol):
         """Tell the result in a few sentences."""
         ...
 
-    def scored(self, folder: RunFolder, run: Mapping[str, Any], options: JudgeOptions) -> Scored:
-        """Score the run in `folder`. Raises `BagError` when it or the truth cannot be read."""
+    def scored(self, case: Case) -> tuple[dict[str, Any], tuple[Any, ...]]:
+        """Give the metrics of a run, and the arguments of ``figures.sections``."""
         ...
 
 
 def judge(folder: RunFolder, options: JudgeOptions | None = None) -> Judgement:
     """Judge a run of any system. Raises `BagError` when it or the truth cannot be read."""
     run = folder.read_run()
-    system: Judge = import_module(SYSTEMS[run['system']].judge)
-    metrics, sections = system.scored(folder, run, options or JudgeOptions())
+    name = SYSTEMS[run['system']].judge
+    system: Judge = import_module(name)
+    metrics, shown = system.scored(Case(folder, run, options or JudgeOptions()))
     return Judgement(
         run=run,
         metrics=metrics,
         words=system.summary_sentence,
         shown=system.METRICS,
         seen=system.SEEN,
-        sections=sections,
+        # plotly, which only a report needs, takes a second to load.
+        sections=lambda: import_module(f'{name}.figures').sections(*shown),
         accuracy=functools.partial(_accuracy, system, metrics),
     )
 
@@ -183,12 +220,3 @@ def _accuracy(system: Judge, metrics: dict[str, Any], at_most: float | None) -> 
             return None
         return Check(f'{limit.meaning} against truth', limit.missed, 'at least one', good=False)
     return limit.check(error, at_most=at_most, remark=fill(system.REMARK, metrics))
-
-
-@contextlib.contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Raises ValueError, by which a table is refused, as `BagError` that names the recording."""
-    try:
-        yield
-    except ValueError as error:
-        raise BagError(f'{path}: {error}') from None

@@ -47,14 +47,11 @@ def counted(number: int, noun: str) -> str:
 
 def error_summary(error: FloatArray, *, unit: str = 'm') -> dict[str, float]:
     """RMSE, median and 95 % point of non-negative errors; NaN when there are none."""
-    if not len(error):
-        return {'n': 0, **{f'{name}_{unit}': float('nan') for name in ('rmse', 'median', 'p95')}}
-    return {
-        'n': len(error),
-        f'rmse_{unit}': float(np.sqrt(np.mean(error**2))),
-        f'median_{unit}': float(np.median(error)),
-        f'p95_{unit}': float(np.percentile(error, 95.0)),
-    }
+    rmse = median = p95 = float('nan')
+    if len(error):
+        rmse, median = float(np.sqrt(np.mean(error**2))), float(np.median(error))
+        p95 = float(np.percentile(error, 95.0))
+    return {'n': len(error), f'rmse_{unit}': rmse, f'median_{unit}': median, f'p95_{unit}': p95}
 
 
 def usable_nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -74,33 +71,21 @@ def chi2_summary(values: FloatArray, dof: int) -> dict[str, Any]:
     """Mean of chi-square values, `dof` expected, with its two-sided 95 % bounds."""
     if not len(values):
         return {'n': 0, 'dof': dof, 'mean': float('nan'), 'believable': None}
-    low, high = average_bounds(len(values), dof)
-    mean = float(np.mean(values))
-    return {
-        'n': len(values),
-        'dof': dof,
-        'mean': mean,
-        'low': low,
-        'high': high,
-        'believable': bool(low <= mean <= high),
-    }
+    return _within(len(values), dof, float(np.mean(values)), *average_bounds(len(values), dof))
+
+
+def _within(n: int, dof: int, mean: float, low: float, high: float) -> dict[str, Any]:
+    bounds = {'low': low, 'high': high, 'believable': bool(low <= mean <= high)}
+    return {'n': n, 'dof': dof, 'mean': mean, **bounds}
 
 
 def nis_summary(nis: FloatArray, dof: FloatArray) -> dict[str, Any]:
     """Mean NIS of all hits with its bounds; divided by the degrees of freedom where these vary."""
     if not len(nis) or (dof == dof[0]).all():
         return chi2_summary(nis, int(dof[0]) if len(nis) else 2)
-    low, high = average_bounds(1, int(dof.sum()))
-    mean, low, high = (float(value / dof.sum()) for value in (nis.sum(), low, high))
-    return {
-        'n': len(nis),
-        'dof': 1,
-        'mean': mean,
-        'low': low,
-        'high': high,
-        'believable': low <= mean <= high,
-        'divided_by_dof': True,
-    }
+    sums = nis.sum(), *average_bounds(1, int(dof.sum()))
+    per_dof = (float(value / dof.sum()) for value in sums)
+    return {**_within(len(nis), 1, *per_dof), 'divided_by_dof': True}
 
 
 MOST_NEES = 2.0
@@ -162,8 +147,6 @@ class Check:
     wanted: str
     good: bool
 
-
-# -- in words ------------------------------------------------------------------------------------
 
 NO_TRUTH = (
     'There is no truth to compare with, so only the estimates and their stated uncertainty are '
@@ -254,9 +237,9 @@ def cards(shown: Iterable[Metric], metrics: Mapping[str, Any]) -> tuple[Card, ..
     )
 
 
-def front(cards: Iterable[Card], most: int = 3) -> list[Card]:
-    """The few key numbers for the front page: those that are meant for it, then the others."""
-    return sorted(cards, key=lambda card: not card.front)[:most]
+def front(cards: Iterable[Card]) -> list[Card]:
+    """The three key numbers for the front page: those that are meant for it, then the others."""
+    return sorted(cards, key=lambda card: not card.front)[:3]
 
 
 def verdict(shown: Iterable[Metric], metrics: Mapping[str, Any]) -> str:

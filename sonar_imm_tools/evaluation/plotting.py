@@ -41,6 +41,81 @@ _TAG = re.compile(r'<(?!/?(?:b|br|extra|i|sub|sup)>)')
 """Where a tag begins that our own texts do not use."""
 
 
+class Picture(go.Figure):
+    """A figure of a report, in its style."""
+
+    def line(
+        self,
+        x: ArrayLike,
+        y: ArrayLike,
+        name: str | None,
+        colour: str,
+        width: float = 2,
+        *,
+        gl: bool = False,
+        **further: Any,
+    ) -> None:
+        """Add a line; gl: it may be drawn by WebGL; further: of the trace."""
+        add = self.add_scattergl if gl else self.add_scatter
+        line = {'color': colour, 'width': width}
+        add(x=x, y=y, **{'mode': 'lines', 'name': name, 'line': line} | further)
+
+    def points(
+        self, x: ArrayLike, y: ArrayLike, name: str, colour: str, size: float = 4, **marker: Any
+    ) -> None:
+        """Add points; marker: more of how they look."""
+        look = {'size': size, 'color': colour} | marker
+        self.add_scattergl(x=x, y=y, mode='markers', name=name, marker=look)
+
+    def band(
+        self,
+        x: FloatArray,
+        low: FloatArray,
+        high: FloatArray,
+        colour: str,
+        opacity: tuple[float, float],
+        name: str | None = None,
+        **further: Any,
+    ) -> None:
+        """Add the band between `low` and `high`; opacity: of the area and of its outline."""
+        area, outline = (transparent(colour, each) for each in opacity)
+        look = {'fill': 'toself', 'fillcolor': area, 'hoverinfo': 'skip'} | further
+        x, y = np.concatenate([x, x[::-1]]), np.concatenate([low, high[::-1]])
+        self.line(x, y, name, outline, 0.5, **look)
+
+    def image(
+        self,
+        x: ArrayLike,
+        y: ArrayLike,
+        z: ArrayLike,
+        title: str = 'probability',
+        *,
+        limits: tuple[float, float] = (0.0, 1.0),
+        colours: str = 'Blues',
+        **further: Any,
+    ) -> None:
+        """Add an image of `z` (y, x); title: of its colours."""
+        bar = {'title': {'text': title, 'side': 'right'}, 'thickness': 12}
+        scale = {'zmin': limits[0], 'zmax': limits[1], 'colorscale': colours, 'colorbar': bar}
+        self.add_heatmap(x=x, y=y, z=z, **scale, **further)
+
+    def styled(self, height: int, x: dict[str, Any], y: dict[str, Any]) -> Picture:
+        """The same in the style of the page; height: in pixels; x, y: what its axes have."""
+        self.update_layout(
+            height=height,
+            margin={'l': 64, 'r': 24, 't': 44, 'b': 52},
+            paper_bgcolor='white',
+            plot_bgcolor='white',
+            font={'family': FONT, 'size': 13, 'color': INK},
+            hovermode='closest',
+            legend={'orientation': 'h', 'y': 1.02, 'yanchor': 'bottom', 'x': 0},
+        )
+        axis = {'gridcolor': GRID, 'zerolinecolor': '#c3ccd5', 'linecolor': '#c3ccd5', 'ticks': ''}
+        self.update_xaxes(x | axis)
+        self.update_yaxes(y | axis)
+        return self
+
+
 def plain_content(figure: go.Figure) -> dict[str, Any]:
     """The content of `figure` as a dict. Names in its texts make no links and load no pictures:
     plotly reads tags in texts, of which those without attributes stay."""
@@ -60,7 +135,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:
+def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> Picture:
     """NIS of every hit over `time` [s], its running mean, and the chi-square bounds.
 
     Where the degrees of freedom vary (more or fewer receivers per ping), NIS is divided by them,
@@ -69,13 +144,13 @@ def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:
     same = len(np.unique(dof)) == 1
     shared = int(dof[0]) if same else 0
     nis = nis if same else nis / dof
-    figure = go.Figure()
+    figure = Picture()
     shown = thin(len(nis), MOST_POINTS)
-    add_points(figure, time[shown], nis[shown], 'NIS of a hit', COLOURS[0], opacity=0.6)
+    figure.points(time[shown], nis[shown], 'NIS of a hit', COLOURS[0], opacity=0.6)
     width = max(5, min(50, len(nis) // 8))
     if len(nis) > width:
         mean = np.convolve(nis, np.full(width, 1.0 / width), mode='valid')
-        add_line(figure, time[width - 1 :], mean, f'mean of {width}', INK, 2, gl=True)
+        figure.line(time[width - 1 :], mean, f'mean of {width}', INK, 2, gl=True)
         if shared:
             low, high = average_bounds(width, shared)
             figure.add_hrect(y0=low, y1=high, fillcolor=AMBER, opacity=0.25, line_width=0)
@@ -86,84 +161,7 @@ def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:
             annotation_text='95 % of the hits should lie below',
         )
     title = 'NIS' if same else 'NIS / degrees of freedom'
-    return styled(figure, 340, TIME, {'title': title, 'rangemode': 'tozero'})
-
-
-def add_line(
-    figure: go.Figure,
-    x: ArrayLike,
-    y: ArrayLike,
-    name: str | None,
-    colour: str,
-    width: float = 2,
-    *,
-    gl: bool = False,
-    **further: Any,
-) -> None:
-    """Add a line; gl: it may be drawn by WebGL; further: of the trace."""
-    add = figure.add_scattergl if gl else figure.add_scatter
-    line = {'color': colour, 'width': width}
-    add(x=x, y=y, **{'mode': 'lines', 'name': name, 'line': line} | further)
-
-
-def add_points(
-    figure: go.Figure,
-    x: ArrayLike,
-    y: ArrayLike,
-    name: str,
-    colour: str,
-    size: float = 4,
-    **marker: Any,
-) -> None:
-    """Add points; marker: more of how they look."""
-    look = {'size': size, 'color': colour} | marker
-    figure.add_scattergl(x=x, y=y, mode='markers', name=name, marker=look)
-
-
-def add_band(
-    figure: go.Figure,
-    x: FloatArray,
-    low: FloatArray,
-    high: FloatArray,
-    colour: str,
-    opacity: tuple[float, float],
-    **further: Any,
-) -> None:
-    """Add the band between `low` and `high`; opacity: of the area and of its outline."""
-    figure.add_scatter(
-        x=np.concatenate([x, x[::-1]]),
-        y=np.concatenate([low, high[::-1]]),
-        fill='toself',
-        fillcolor=transparent(colour, opacity[0]),
-        mode='lines',
-        line={'color': transparent(colour, opacity[1]), 'width': 0.5},
-        hoverinfo='skip',
-        **further,
-    )
-
-
-def add_image(
-    figure: go.Figure,
-    x: ArrayLike,
-    y: ArrayLike,
-    z: ArrayLike,
-    title: str = 'probability',
-    *,
-    limits: tuple[float, float] = (0.0, 1.0),
-    colours: str = 'Blues',
-    **further: Any,
-) -> None:
-    """Add an image of `z` (y, x); title: of its colours."""
-    figure.add_heatmap(
-        x=x,
-        y=y,
-        z=z,
-        zmin=limits[0],
-        zmax=limits[1],
-        colorscale=colours,
-        colorbar={'title': {'text': title, 'side': 'right'}, 'thickness': 12},
-        **further,
-    )
+    return figure.styled(340, TIME, {'title': title, 'rangemode': 'tozero'})
 
 
 def seconds(stamp_ns: IntArray, scan_ns: IntArray) -> FloatArray:
@@ -180,23 +178,6 @@ def transparent(colour: str, opacity: float) -> str:
     """The colour ``#rrggbb`` with an opacity from 0 to 1."""
     red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
     return f'rgba({red},{green},{blue},{opacity})'
-
-
-def styled(figure: go.Figure, height: int, x: dict[str, Any], y: dict[str, Any]) -> go.Figure:
-    """Give `figure` the style of the page; height: in pixels; x, y: what its axes have."""
-    figure.update_layout(
-        height=height,
-        margin={'l': 64, 'r': 24, 't': 44, 'b': 52},
-        paper_bgcolor='white',
-        plot_bgcolor='white',
-        font={'family': FONT, 'size': 13, 'color': INK},
-        hovermode='closest',
-        legend={'orientation': 'h', 'y': 1.02, 'yanchor': 'bottom', 'x': 0},
-    )
-    axis = {'gridcolor': GRID, 'zerolinecolor': '#c3ccd5', 'linecolor': '#c3ccd5', 'ticks': ''}
-    figure.update_xaxes(x | axis)
-    figure.update_yaxes(y | axis)
-    return figure
 
 
 def in_degrees(figure: go.Figure, origin: Origin) -> go.Figure:
@@ -227,7 +208,7 @@ def in_degrees(figure: go.Figure, origin: Origin) -> go.Figure:
     start, height = x_range[0] + 0.04 * width, y_range[0] + 0.04 * (y_range[1] - y_range[0])
     at = geodetic([start, start + bar], [height, height])
     name = f'{bar / 1000:g} km' if bar >= 1000.0 else f'{bar:g} m'
-    add_line(figure, *at, name, INK, 4, hoverinfo='skip', showlegend=False)
+    figure.line(*at, name, INK, 4, hoverinfo='skip', showlegend=False)
     figure.add_annotation(
         x=at[0][0], y=at[1][0], text=name, showarrow=False, yshift=12, xanchor='left'
     )
@@ -263,19 +244,17 @@ def thumbnail(figure: go.Figure) -> str:
     """
     traces = [trace for trace in figure.data if trace.type in ('scatter', 'scattergl')]
     traces = [trace for trace in traces if (trace.xaxis or 'x') == 'x' and len(trace.x)]
-    points = [_points(trace) for trace in traces]
+    points = [np.array([trace.x, trace.y], dtype=float).T for trace in traces]
+    points = [
+        xy if trace.fill else xy[thin(len(xy), THUMBNAIL_POINTS)]
+        for trace, xy in zip(traces, points)
+    ]
     place = _placement(figure.layout, points)
     shapes = ''.join(_shapes(trace, place(xy)) for trace, xy in zip(traces, points))
     return (
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" aria-hidden="true" fill="none" '
         f'stroke-linecap="round">{shapes}</svg>'
     )
-
-
-def _points(trace: Any) -> FloatArray:
-    """Return the points of a trace, (N, 2), NaN where its line is broken."""
-    xy = np.column_stack([np.asarray(trace.x, dtype=float), np.asarray(trace.y, dtype=float)])
-    return xy if trace.fill else xy[thin(len(xy), THUMBNAIL_POINTS)]
 
 
 def _placement(layout: go.Layout, points: list[FloatArray]) -> Any:
@@ -306,36 +285,27 @@ def _placement(layout: go.Layout, points: list[FloatArray]) -> Any:
 
 
 def _shapes(trace: Any, pixels: FloatArray) -> str:
-    """Return the paths of one trace; pixels: (N, 2)."""
-    shapes = ''
-    mode = trace.mode or 'lines'
+    shapes, mode = '', trace.mode or 'lines'
     line, marker = trace.line, trace.marker
     if trace.fill:
-        shapes += f'<path fill="{trace.fillcolor}" stroke="none" d="{_path(pixels)}"/>'
+        shapes = f'<path fill="{trace.fillcolor}" stroke="none" d="{_path(pixels)}"/>'
     elif 'lines' in mode:
+        look = f'stroke="{line.color or GREY}" stroke-width="1.5"'
         dash = ' stroke-dasharray="2 3"' if line.dash else ''
-        shapes += (
-            f'<path stroke="{line.color or GREY}" stroke-width="1.5"{dash} d="{_path(pixels)}"/>'
-        )
+        shapes = f'<path {look}{dash} d="{_path(pixels)}"/>'
     if mode == 'markers':
         colour = marker.color if isinstance(marker.color, str) else marker.line.color
-        shapes += (
-            f'<path stroke="{colour or GREY}" stroke-width="2.5" '
-            f'd="{"".join(f"M{x:.1f} {y:.1f}h0" for x, y in pixels[_finite(pixels)])}"/>'
-        )
+        dots = ''.join(f'M{x:.1f} {y:.1f}h0' for x, y in pixels[np.isfinite(pixels).all(axis=1)])
+        shapes += f'<path stroke="{colour or GREY}" stroke-width="2.5" d="{dots}"/>'
     return shapes
 
 
 def _path(pixels: FloatArray) -> str:
     """Return the commands of a path that is broken at NaN."""
-    parts = []
-    pen_up = True
-    for (x, y), drawn in zip(pixels, _finite(pixels)):
+    parts, pen_up = [], True
+    seen: Any = np.isfinite(pixels).all(axis=1)
+    for (x, y), drawn in zip(pixels, seen):
         if drawn:
             parts.append(f'{"M" if pen_up else "L"}{x:.1f} {y:.1f}')
         pen_up = not drawn
     return ''.join(parts)
-
-
-def _finite(pixels: FloatArray) -> Any:
-    return np.isfinite(pixels).all(axis=1)

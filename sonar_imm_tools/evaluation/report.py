@@ -175,11 +175,14 @@ def report_html(part: Part, front_page: str = '') -> str:
     """The page of a run as text; the same part gives the same bytes. front_page: where the front
     page of several is, which share plotly.js; without one it is inside the page."""
     figures = [section.figure for section in part.sections if section.figure is not None]
+    # Those with most points are drawn by WebGL.
+    heavy = [figure for figure in figures if _gl_points(figure) >= LEAST_GL_POINTS]
+    fast = sorted(heavy, key=_gl_points, reverse=True)[:MOST_GL_FIGURES]
     return rendered(
         'report.html',
         part=part,
         front_page=quote(front_page),
-        draw=partial(_packed_figure, _accelerated(figures)),
+        draw=partial(_packed_figure, fast),
         plotlyjs='' if front_page else packed(_plotlyjs()),
     )
 
@@ -187,17 +190,14 @@ def report_html(part: Part, front_page: str = '') -> str:
 def front_html(parts: Sequence[Part], links: Sequence[str]) -> str:
     """The front page of several runs, a row for each, with the address of its page."""
     rows = [(part, quote(link), front(part.cards)) for part, link in zip(parts, links)]
-    return rendered('front.html', rows=rows, pictures=_pictures(parts, links))
-
-
-def _pictures(parts: Sequence[Part], links: Sequence[str]) -> list[tuple[Part, str, str]]:
-    """Return one run of each system, the one with most checks: with its link and picture."""
+    # The picture of one run of each system, the one with most checks.
     best: dict[str, tuple[Part, str, go.Figure]] = {}
     for part, link in zip(parts, links):
         held, picture = best.get(part.run['system']), part.picture
         if picture is not None and (held is None or len(part.checks) > len(held[0].checks)):
             best[part.run['system']] = part, link, picture
-    return [(part, quote(link), thumbnail(picture)) for part, link, picture in best.values()]
+    pictures = [(part, quote(link), thumbnail(drawn)) for part, link, drawn in best.values()]
+    return rendered('front.html', rows=rows, pictures=pictures)
 
 
 def rendered(template: str, **values: Any) -> str:
@@ -248,15 +248,8 @@ def _plotlyjs() -> str:
 
 def packed(text: str) -> str:
     """A text as the page has it: gzip as base64."""
-    return base64.b64encode(
-        gzip.compress(text.encode('utf-8', 'backslashreplace'), mtime=0)
-    ).decode('ascii')
-
-
-def _accelerated(figures: Sequence[go.Figure]) -> list[go.Figure]:
-    """The figures that are drawn by WebGL: the few that have most points."""
-    heavy = [figure for figure in figures if _gl_points(figure) >= LEAST_GL_POINTS]
-    return sorted(heavy, key=_gl_points, reverse=True)[:MOST_GL_FIGURES]
+    compressed = gzip.compress(text.encode('utf-8', 'backslashreplace'), mtime=0)
+    return base64.b64encode(compressed).decode('ascii')
 
 
 def _gl_points(figure: go.Figure) -> int:
@@ -264,7 +257,6 @@ def _gl_points(figure: go.Figure) -> int:
 
 
 def _packed_figure(accelerated: Sequence[go.Figure], figure: go.Figure) -> str:
-    """Data and layout of a figure, `packed`."""
     content = plain_content(figure)
     if not any(figure is fast for fast in accelerated):
         for trace in content['data']:

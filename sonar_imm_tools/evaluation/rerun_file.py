@@ -76,9 +76,8 @@ def _first_picture(system: str, lasting: Counter[int]) -> blueprint.Blueprint:
         blueprint.TimeSeriesView(origin=f'/{system}/track_{track}/{kind}', name=f'{track}: {kind}')
         for kind in ('probability', 'state', 'std')
     ]
-    return blueprint.Blueprint(
-        blueprint.Horizontal(scene, blueprint.Vertical(*curves), column_shares=[3, 2])
-    )
+    beside = blueprint.Vertical(*curves)
+    return blueprint.Blueprint(blueprint.Horizontal(scene, beside, column_shares=[3, 2]))
 
 
 def _log(

@@ -29,7 +29,7 @@ parameter; the least supported parameter is dropped until all have support. All 
 determined``: they keep their values, and the determined ones are fitted once more.
 
 The sums are exact (`math.fsum`), so that neither the order of recordings nor the number of
-processes changes a byte.
+processes changes a byte. In one file, since it is one estimate.
 """
 
 from __future__ import annotations
@@ -97,6 +97,11 @@ class Tunable:
     scanned: bool = False
     step: float = STEP
 
+    @classmethod
+    def of(cls, config: Config, name: str, **settings: Any) -> Tunable:
+        """A parameter that starts as it is configured."""
+        return cls(name=name, start=getattr(config, name), **settings)
+
     @property
     def label(self) -> str:
         return self.name if self.place is None else f'{self.name}[{self.place}]'
@@ -116,10 +121,8 @@ class Tunable:
         low = min(max(edge[0], self.least, spec.low or 0.0), self.start)
         high = max(min(edge[1], edge[1] if spec.high is None else spec.high), self.start)
         u = self.coordinate(self.start)
-        return (
-            max(u - 4.0 * self.std, self.coordinate(low)),
-            min(u + 4.0 * self.std, self.coordinate(high)),
-        )
+        around = u - 4.0 * self.std, u + 4.0 * self.std
+        return max(around[0], self.coordinate(low)), min(around[1], self.coordinate(high))
 
     def grid(self, config: Config) -> list[float]:
         """Return the coordinates that are tried first, none for most parameters."""
@@ -151,7 +154,13 @@ class Recording:
 
     def scores(self, values: Mapping[str, Any], until: float = math.inf) -> Scores:
         """What a tracker with these parameters predicts, stamp by stamp, up to `until`."""
-        config = evolve(self.config, **_in_range(self.config, values))
+        specs, inside = {spec.name: spec for spec in self.config.specs()}, {}
+        for name, value in values.items():  # rounding and steps may leave the range
+            low, high = specs[name].low, specs[name].high
+            limits = -math.inf if low is None else low, math.inf if high is None else high
+            clipped = np.clip(value, *limits).tolist()
+            inside[name] = tuple(clipped) if isinstance(value, tuple) else clipped
+        config = evolve(self.config, **inside)
         tracker = _predictive(self.system).Scored(config, self.measurements)
         intake = Intake(tracker, self.frame_id)
         for measurement in self.measurements:
@@ -165,19 +174,6 @@ class Recording:
                 tracker.process(admitted)
         found: Scores = tracker.scores
         return found
-
-
-def _in_range(config: Config, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values within the ranges of their parameters, which rounding and the steps of
-    differences may leave."""
-    specs = {spec.name: spec for spec in config.specs()}
-    inside = {}
-    for name, value in values.items():
-        low, high = specs[name].low, specs[name].high
-        limits = -math.inf if low is None else low, math.inf if high is None else high
-        clipped = np.clip(value, *limits).tolist()
-        inside[name] = tuple(clipped) if isinstance(value, tuple) else clipped
-    return inside
 
 
 def _predictive(system: str) -> Any:
@@ -288,8 +284,7 @@ def maximise(
 def errors(
     fitting: Fitting, best: FloatArray, evaluate: Callable[[list[FloatArray]], list[float]]
 ) -> FloatArray:
-    """Standard errors (p,) of the coordinates, from the curvature at `best`; infinite where it has
-    none."""
+    """Standard errors (p,) of the coordinates by the curvature at `best`; infinite without one."""
     p = len(best)
     step = np.diag([t.step for t in fitting.tunables])
     pairs = list(itertools.combinations(range(p), 2))
@@ -297,12 +292,8 @@ def errors(
     for k in range(p):
         points += [best + step[k], best - step[k]]
     for i, j in pairs:
-        points += [
-            best + step[i] + step[j],
-            best + step[i] - step[j],
-            best - step[i] + step[j],
-            best - step[i] - step[j],
-        ]
+        ahead, back = best + step[i], best - step[i]
+        points += [ahead + step[j], ahead - step[j], back + step[j], back - step[j]]
     f = evaluate(points)
     H = np.empty((p, p))
     for k in range(p):
@@ -371,18 +362,18 @@ def prepared(jobs: Sequence[Job], names: Sequence[str]) -> tuple[Fitting, int]:
     known = {t.name for t in every}
     for name in names:
         if name not in known:
-            specs = [spec.name for spec in first.config.specs()]
-            if name not in specs:
+            if all(spec.name != name for spec in first.config.specs()):
                 raise ConfigError(f"unknown parameter '{name}'{did_you_mean(name, known)}")
+            can = ', '.join(sorted(known))
             raise ConfigError(
-                f"parameter '{name}' cannot be fitted to this recording; these can: "
-                + ', '.join(sorted(known))
+                f"parameter '{name}' cannot be fitted to this recording; these can: {can}"
             )
     tunables = tuple(t for t in every if (t.name in names if names else t.usual))
     for tunable in tunables:
         if len({str(getattr(each.config, tunable.name)) for each in recordings}) > 1:
+            name = tunable.name
             raise ConfigError(
-                f'the recordings have different {tunable.name}: --params or --set gives them one'
+                f'the recordings have different {name}: --params or --set gives them one'
             )
     split, count = [], 0
     for recording in recordings:
@@ -453,7 +444,8 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
     sharp = (se <= DETERMINED) & ~at_bound
 
     before, _ = fitting.scores(None)
-    after, values, final = before, {}, best.copy()
+    values: dict[str, Any] = {}
+    after, final = before, best.copy()
     gain, gains, kept, evaluations = _supported(fitting, start, sharp, together)
     used += evaluations
     if len(kept):
@@ -465,7 +457,9 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
         chosen = np.array(written)
         ((after, _),) = together(again.scores, [(chosen,)])
         used += 1
-        values = _as_written(values_of(again.tunables, chosen))
+        for name, value in values_of(again.tunables, chosen).items():
+            several = isinstance(value, tuple)
+            values[name] = [rounded(each) for each in value] if several else rounded(value)
     rows = []
     for k, tunable in enumerate(tunables):
         place = final[k]
@@ -538,13 +532,6 @@ def _supported(
             break
         kept = np.delete(kept, weakest)
     return gain, gains, kept, used
-
-
-def _as_written(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: [rounded(v) for v in value] if isinstance(value, tuple) else rounded(value)
-        for name, value in values.items()
-    }
 
 
 @contextlib.contextmanager

@@ -6,7 +6,6 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Trackers run over recordings without ROS: a run and its folder, many runs, and what is in a
-recording."""
+"""Trackers run over recordings without ROS: runs and their folders, what is in a recording."""
 
 __all__ = ['batch', 'inspection', 'jobs', 'run_folder', 'tracking']

@@ -61,7 +61,7 @@ class Job:
 
     bag: Path
     folder: Path
-    instrument: str
+    instrument: str = ''
     system: str
     config: Config
     options: InputOptions
@@ -71,11 +71,14 @@ class Job:
     tables: str = AS_CSV
     version: str = __version__
 
+    def outcome(self, **came: Any) -> Outcome:
+        """What became of it."""
+        return Outcome(bag=self.bag, folder=self.folder, instrument=self.instrument, **came)
+
 
 @frozen(kw_only=True)
 class Outcome:
-    """What became of a job: its state, the content of run.json, or the sentence why there is
-    none."""
+    """What became of a job: its state, the content of run.json, or why there is none."""
 
     bag: Path
     folder: Path
@@ -102,12 +105,12 @@ def track(job: Job, advance: Callable[[int], Advance] | None = None) -> Outcome:
         if job.resume and not overwrite:
             if (run := _same_run(folder, offline)) is not None and _complete(job, run):
                 remove_leftovers(job.folder)
-                return _outcome(job, KEPT, run)
+                return job.outcome(state=KEPT, run=run)
             overwrite = True  # it is not finished, or the same without these tables
         with folder.fresh(overwrite=overwrite, inputs=[job.bag]) as unfinished:
             advanced = advance(offline.total) if advance else lambda count: None
             run = write_run(unfinished, offline, advanced, tables=job.tables)
-        return _outcome(job, TRACKED, run)
+        return job.outcome(state=TRACKED, run=run)
 
 
 def _same_run(folder: RunFolder, offline: OfflineRun) -> dict[str, Any] | None:
@@ -123,19 +126,17 @@ def _same_run(folder: RunFolder, offline: OfflineRun) -> dict[str, Any] | None:
     other = [name for name in wanted if run.get(name) != wanted[name]]
     if not other:
         return run
-    named = [_differences(name, run.get(name), wanted[name]) for name in other]
+    named = []
+    for name in other:
+        old, new = run.get(name), wanted[name]
+        if isinstance(old, dict) and isinstance(new, dict):
+            keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+            name += f' ({", ".join(keys[:3])}{", ..." if len(keys) > 3 else ""})'
+        named.append(name)
     raise BagError(
         f'{folder.path} holds another run, which differs in {", ".join(named)}; choose another '
         'folder or say --overwrite'
     )
-
-
-def _differences(name: str, old: Any, new: Any) -> str:
-    """What differs, by the names of parameters where they are the difference."""
-    if not (isinstance(old, dict) and isinstance(new, dict)):
-        return name
-    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-    return f'{name} ({", ".join(keys[:3])}{", ..." if len(keys) > 3 else ""})'
 
 
 def _complete(job: Job, run: Mapping[str, Any]) -> bool:
@@ -148,21 +149,12 @@ def _complete(job: Job, run: Mapping[str, Any]) -> bool:
     return all((job.folder / name).is_file() for name in names)
 
 
-def _outcome(job: Job, state: str, run: Mapping[str, Any]) -> Outcome:
-    return Outcome(bag=job.bag, folder=job.folder, instrument=job.instrument, state=state, run=run)
-
-
-def failed(job: Job, sentence: str) -> Outcome:
-    """The outcome of a job that was not done."""
-    return Outcome(bag=job.bag, folder=job.folder, instrument=job.instrument, failure=sentence)
-
-
 def run_job(job: Job) -> Outcome:
     """Do a job; never raises, since a bad recording must not end the others."""
     try:
         return track(job)
     except Exception as error:
-        return failed(job, sentence_of(error))
+        return job.outcome(failure=sentence_of(error))
 
 
 def run_jobs(
@@ -180,7 +172,7 @@ def run_jobs(
     if address is not None:
         with cluster(address, note) as client:
             for number, outcome, failure in as_they_end(client, run_job, [(job,) for job in jobs]):
-                yield _seen(outcome) if outcome else failed(jobs[number], failure)
+                yield _seen(outcome) if outcome else jobs[number].outcome(failure=failure)
     elif min(count, len(jobs)) <= 1:
         yield from map(run_job, jobs)
     else:
@@ -199,25 +191,18 @@ def _seen(outcome: Outcome) -> Outcome:
     return evolve(outcome, state=FAILED, run=None, failure=sentence)
 
 
-# -- what is told of them ------------------------------------------------------------------------
-
-
 def summary_of(out: Path, outcomes: Iterable[Outcome], name: str = SUMMARY) -> dict[str, Any]:
     """The content of summary.json, or of a shard's: of each run where it is and what came of it.
     Earlier runs in it that are in `out` still stay in it."""
     fresh = [_entry(out, outcome) for outcome in outcomes]
-    folders = {entry['folder'] for entry in fresh}
-    kept = [
-        entry
-        for entry in (_entries(out / name) if (out / name).is_file() else [])
-        if entry['folder'] not in folders and (out / entry['folder'] / RUN).is_file()
-    ]
+    new = {entry['folder'] for entry in fresh}
+    earlier = _entries(out / name) if (out / name).is_file() else []
+    kept = [e for e in earlier if e['folder'] not in new and (out / e['folder'] / RUN).is_file()]
     return {'runs': kept + fresh}
 
 
 def _entry(out: Path, outcome: Outcome) -> dict[str, Any]:
     run = outcome.run or {}
-    refused = sum(entry['count'] for entry in run.get('refused', {}).values())
     return {
         'folder': outcome.folder.resolve().relative_to(out.resolve()).as_posix(),
         'bag': str(outcome.bag.resolve()),
@@ -226,18 +211,13 @@ def _entry(out: Path, outcome: Outcome) -> dict[str, Any]:
         'failure': outcome.failure,
         'system': run.get('system', ''),
         'messages': run.get('messages', 0),
-        'refused': refused,
+        'refused': sum(entry['count'] for entry in run.get('refused', {}).values()),
         'estimates': run.get('estimates', 0),
         'rows': run.get('rows', 0),
         'wall_s': run.get('timings', {}).get('wall_s'),
         'warnings': list(run.get('warnings', [])),
         'problems': list(run.get('problems', [])),
     }
-
-
-def write_summary(out: Path, content: Mapping[str, Any], name: str = SUMMARY) -> None:
-    """Write summary.json, or a shard's."""
-    RunFolder(out).write_json(name, dict(content))
 
 
 def run_folders(out: Path) -> list[Path]:

@@ -76,8 +76,7 @@ class Initial:
 
 
 def target_numbers(tags: Sequence[str], noted: Mapping[str, str]) -> dict[str, int]:
-    """Return the numbers of target names. tags: the parameter; noted: names by number, of the
-    recording."""
+    """Return the numbers of target names. tags: the parameter; noted: names by number."""
     return {name: int(number) for number, name in noted.items()} | tag_numbers(tags)
 
 

@@ -43,8 +43,6 @@ LONG_GAP = 10.0
 
 @define
 class _Found:
-    """What was found on one topic."""
-
     topic: TopicInfo
     logs: array[int] = field(factory=lambda: array('q'))
     stamps: array[int] = field(factory=lambda: array('q'))
@@ -109,13 +107,18 @@ def _look_at(item: BagMessage, found: _Found, detector: Mapping[str, Any]) -> No
             found.stamps.append(stamp)
         else:
             found.no_stamp += 1
-    for system, entry in _readers(item):
+    for system, entry in [] if is_truth(item.topic) else _readers(item):
         try:
             settings = detector if entry.makes else {}
             made = entry.reader(item.type_name, 'enu', settings)(item.message)
             found.good[system, entry.name] += 1
             if isinstance(made, (Fix, GeodeticFix)) and len(found.fixes) < MOST_FIXES:
-                found.fixes.append((made.stamp_ns, *_place(made)))
+                if isinstance(made, Fix):
+                    place = made.position[:2].tolist()
+                else:  # metres east and north nearly
+                    place = [111e3 * made.longitude * np.cos(np.radians(made.latitude))]
+                    place.append(111e3 * made.latitude)
+                found.fixes.append((made.stamp_ns, *place))
             if (code := entry.doubt(item.message, made)) is not None:
                 found.doubts[code] += 1
         except Rejection as rejection:
@@ -127,14 +130,10 @@ def _look_at(item: BagMessage, found: _Found, detector: Mapping[str, Any]) -> No
 
 
 def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
-    """The tracker inputs that a message could be for. Truth is no input."""
-    if is_truth(item.topic):
-        return []
+    """The tracker inputs that a message could be for."""
     found = []
     for system in SYSTEMS:
-        fitting = [
-            entry for entry in every_input(system) if entry.may_be(item.topic, item.type_name)
-        ]
+        fitting = [each for each in every_input(system) if each.may_be(item.topic, item.type_name)]
         # Of several inputs that a name says, the later one counts, as in `fitting_topics`.
         named = [entry for entry in fitting if entry.is_named(item.topic)][-1:]
         found += [(system, entry) for entry in named or fitting]
@@ -143,25 +142,20 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
 
 def _topic_entry(found: _Found) -> dict[str, Any]:
     span = (found.logs[-1] - found.logs[0]) / SECOND if found.logs else 0.0
-    suits = [f'{system} {name}' for system, name in found.good]
+    scans = None  # of a topic of scans: how many stamps, and the most messages that share one
+    if found.stamps and _holds_scans(found):
+        counts = np.unique(np.array(found.stamps, np.int64), return_counts=True)[1]
+        scans = {'count': len(counts), 'most': int(counts.max())}
     return {
         'name': found.topic.name,
         'type': found.topic.type_name,
         'count': found.topic.count,
         'rate_hz': (len(found.logs) - 1) / span if span > 0 else None,
         'frames': list(found.frames),
-        'suits': suits,
-        'scans': _scans(found),
+        'suits': [f'{system} {name}' for system, name in found.good],
+        'scans': scans,
         'problems': _stamp_problems(found) + _content_problems(found) + _scan_hint(found),
     }
-
-
-def _place(fix: Fix | GeodeticFix) -> tuple[float, float]:
-    """Metres east and north, of latitudes nearly."""
-    if isinstance(fix, Fix):
-        return float(fix.position[0]), float(fix.position[1])
-    degree = 111e3
-    return degree * fix.longitude * float(np.cos(np.radians(fix.latitude))), degree * fix.latitude
 
 
 def _scan_hint(found: _Found) -> list[str]:
@@ -184,14 +178,6 @@ def _scan_hint(found: _Found) -> list[str]:
         f'every fix has a stamp of its own, and each diver comes again after {period:.3g} s: '
         f'where the sensor rotates or polls, --set scan_period={period:.3g} makes scans of them'
     ]
-
-
-def _scans(found: _Found) -> dict[str, int] | None:
-    """Number of stamps of a topic of scans, and the most messages that share one; else None."""
-    if not found.stamps or not _holds_scans(found):
-        return None
-    counts = np.unique(np.array(found.stamps, np.int64), return_counts=True)[1]
-    return {'count': len(counts), 'most': int(counts.max())}
 
 
 def _holds_scans(found: _Found) -> bool:
@@ -266,9 +252,8 @@ def _systems(
     systems: dict[str, Inputs] = {}
     options: dict[str, dict[str, str]] = {}
     for system in fitting_systems(bag):
-        named = {
-            entry.name for each in instruments(bag, system).values() for entry in each.values()
-        }
+        every = instruments(bag, system).values()
+        named = {entry.name for inputs in every for entry in inputs.values()}
         if _enough(system, named & found.get(system, {}).keys()):
             systems[system], options[system] = found[system], {}
     taken = {

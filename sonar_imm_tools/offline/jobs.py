@@ -54,8 +54,7 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
 
 def _fresh(count: int) -> ProcessPoolExecutor:
     """Processes that are no forks of this one: a fork copies the threads of a library half. On
-    Linux they are forks of one that has done nothing but load the libraries; those of macOS do not
-    outlive a fork."""
+    Linux they are forks of one that only loaded libraries; on macOS a fork does not live."""
     context = multiprocessing.get_context('forkserver' if sys.platform == 'linux' else 'spawn')
     if sys.platform == 'linux':
         context.set_forkserver_preload(LIBRARIES)
@@ -68,9 +67,11 @@ def _fresh(count: int) -> ProcessPoolExecutor:
         ) from None
 
 
-Run = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Iterator[tuple[int, Any, str]]]
-"""``run(work, calls)``: as they end, the number of each call, what came of it, and the sentence
-why nothing did."""
+Work = Callable[..., Any]
+Calls = Sequence[tuple[Any, ...]]
+Ended = Iterator[tuple[int, Any, str]]
+Run = Callable[[Work, Calls], Ended]
+"""``run(work, calls)``: as they end, the number of each call, what came of it, or why nothing."""
 
 
 @contextlib.contextmanager
@@ -92,9 +93,7 @@ def workers(
             yield pool.run
 
 
-def _in_turn(
-    work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
-) -> Iterator[tuple[int, Any, str]]:
+def _in_turn(work: Work, calls: Calls) -> Ended:
     for k, call in enumerate(calls):
         try:
             result = work(*call)
@@ -118,9 +117,7 @@ class _Pool:
         if self._executor is not None:
             self._executor.shutdown(wait=error[0] is None, cancel_futures=True)
 
-    def run(
-        self, work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
-    ) -> Iterator[tuple[int, Any, str]]:
+    def run(self, work: Work, calls: Calls) -> Ended:
         left = dict(enumerate(calls))
         yield from self._some(work, left)
         for k in list(left):  # those that were under way or not begun when a process died
@@ -129,9 +126,7 @@ class _Pool:
             if alone:
                 yield k, None, 'the process that did it was ended, perhaps for lack of memory'
 
-    def _some(
-        self, work: Callable[..., Any], left: dict[int, tuple[Any, ...]]
-    ) -> Iterator[tuple[int, Any, str]]:
+    def _some(self, work: Work, left: dict[int, tuple[Any, ...]]) -> Ended:
         """Do what is `left`, and take away what was done, until a process dies."""
         if self._executor is None:
             self._executor = _fresh(self._count)
@@ -174,9 +169,8 @@ def cluster(address: str, note: Callable[[str], None] = lambda sentence: None) -
     try:
         identity = asyncio.run(asyncio.wait_for(_identity(address), CONNECT_SECONDS))
     except asyncio.TimeoutError:
-        raise ConfigError(
-            f'no dask scheduler answers at {address} within {CONNECT_SECONDS:g} s'
-        ) from None
+        within = f'within {CONNECT_SECONDS:g} s'
+        raise ConfigError(f'no dask scheduler answers at {address} {within}') from None
     except Exception as error:  # whatever a program says that is no scheduler
         raise ConfigError(f'no dask scheduler at {address}: {sentence_of(error)}') from None
     if not identity.get('workers'):
@@ -194,12 +188,9 @@ async def _identity(address: str) -> dict[str, Any]:
         return await remote.identity()
 
 
-def as_they_end(
-    client: Any, work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
-) -> Iterator[tuple[int, Any, str]]:
-    """``work(*call)`` for each of `calls` on the workers of a dask client: the number of the call,
-    what came of it, and the sentence why nothing did. A worker may have died, or the scheduler be
-    gone."""
+def as_they_end(client: Any, work: Work, calls: Calls) -> Ended:
+    """``work(*call)`` for each of `calls` on the workers of a dask client, as `Run` has it. A
+    worker may have died, or the scheduler be gone."""
     from distributed import as_completed as ended
 
     futures = {client.submit(work, *call, pure=False): k for k, call in enumerate(calls)}

@@ -22,7 +22,7 @@ compressed by zstd. A run is written elsewhere and moved to its folder when it i
 `sonar_imm.files`.
 
 Bag and tables hold nothing that depends on the time of the run: the same command writes the same
-bytes. Times and versions are in run.json.
+bytes. Times and versions are in run.json. In one file, since all of it is the layout of a folder.
 """
 
 from __future__ import annotations
@@ -366,8 +366,8 @@ class RunFolder:
         the one called `but`, or of a file of its recording."""
         place = Path(os.path.realpath(out))
         here = Path(os.path.realpath(self.path))
-        own = [Path(os.path.realpath(here / name)) for name in (*_RUN_FILES, MARKER)]
-        own += [here / name for name in (*_RUN_FILES, MARKER)]
+        named = [here / name for name in (*_RUN_FILES, MARKER)]
+        own = [*named, *(Path(os.path.realpath(name)) for name in named)]
         if place != here / but and any(place.is_relative_to(item) for item in own):
             raise BagError(f'{out} is a file of the run {self.path}; choose another name')
         bag = self.read_run()['bag']

@@ -80,6 +80,13 @@ class Refused:
     example: str
 
 
+OF_HEALTH = (
+    'covariance_repairs', 'not_started', 'names_without_track', 'pings_moving_alike',
+    'waiting_for_vessel',
+)  # fmt: skip
+"""What run.json counts of the health of a tracker."""
+
+
 class Revisions:
     """Holds estimates while they can still be revised; the last one of a stamp, and of each
     instrument, counts.
@@ -116,10 +123,8 @@ class Revisions:
 def final_estimates(estimates: Iterable[Estimate], config: Config) -> list[Estimate]:
     """The final estimate of each stamp out of everything a live tracker of `config` published."""
     revisions = Revisions(window_ns(config))
-    return [
-        *(final for estimate in estimates for final in revisions.add([estimate])),
-        *revisions.finish(),
-    ]
+    final = [each for estimate in estimates for each in revisions.add([estimate])]
+    return final + revisions.finish()
 
 
 def window_ns(config: Config) -> int:
@@ -144,11 +149,10 @@ class OfflineRun:
         self.system = system
         chosen = fitting_topics(bag, system.name, self.options.topics)
         settings = config.as_dict()
-        self.topics = {
-            name: entry.name for name, entry in chosen.items() if entry.wanted(settings)
-        }
+        wanted = {name: entry for name, entry in chosen.items() if entry.wanted(settings)}
+        self.topics = {name: entry.name for name, entry in wanted.items()}
         entries = {entry.name: entry for entry in inputs_of(system.name)}
-        made = [chosen[name].makes or chosen[name].name for name in self.topics]
+        made = [entry.makes or entry.name for entry in wanted.values()]
         self._kinds = {kind for name in made for kind in entries[name].measurements}
         build = system.build_smoother if self.options.smooth else system.build
         self.tracker: Any = build(config.for_inputs(frozenset(self.topics.values())))
@@ -219,8 +223,7 @@ class OfflineRun:
         return made
 
     def read(self, advance: Callable[[int], None] = lambda count: None) -> Iterator[Received]:
-        """What the messages hold, in order: measurements and refusals. `advance` hears of each
-        message."""
+        """Measurements and refusals of the messages, in order; `advance` hears of each message."""
         for item in measurements_of(
             self.bag,
             self.system.name,
@@ -251,8 +254,7 @@ class OfflineRun:
             yield from self._admitted('--initial', late)
 
     def _admitted(self, topic: str, measurement: Any, first_ns: int = 0) -> Iterator[Any]:
-        """Yield a measurement, or a start as of `first_ns`, as the tracker is to have it; nothing
-        if it is refused."""
+        """Yield a measurement, or a start as of `first_ns`, for the tracker, if not refused."""
         try:
             if isinstance(measurement, Rejection):
                 raise measurement
@@ -287,11 +289,7 @@ class OfflineRun:
         pings in which most obstacles moved alike, and messages refused before."""
         counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
         health = self.tracker.health()
-        kept = (
-            *('covariance_repairs', 'not_started', 'names_without_track'),
-            *('pings_moving_alike', 'waiting_for_vessel'),
-        )
-        for name in kept:
+        for name in OF_HEALTH:
             if count := health.get(name):
                 counts[name] = int(count)
         if self._intake.repeats.rows:
@@ -369,17 +367,15 @@ def write_run(
         'topics': json.dumps(offline.topics),
         'parameters': json.dumps(finite(recipe['parameters'])),
     }
-    written = folder.write_estimates(
-        offline.estimates(advance), system, tables=tables, notes=notes
-    )
-    if not written['estimates'] and (failure := offline.failure()):
+    made = folder.write_estimates(offline.estimates(advance), system, tables=tables, notes=notes)
+    if not made['estimates'] and (failure := offline.failure()):
         raise BagError(f'{path}: {failure}')
     seconds = time.perf_counter() - begin
     run = run_record(
         bag=str(path.resolve()),
         **recipe,
         messages=offline.messages,
-        **written,
+        **made,
         written_bytes=sum(f.stat().st_size for f in folder.path.rglob('*') if f.is_file()),
         counts=offline.outcomes(),
         refused={reason: asdict(entry) for reason, entry in sorted(offline.refused.items())},

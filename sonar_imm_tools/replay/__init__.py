@@ -6,7 +6,6 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Real nodes fed from recordings: playing at the recorded pace or in lock-step, and hearing what
-they publish."""
+"""Real nodes fed from recordings, at the recorded pace or in lock-step, and what they publish."""
 
 __all__ = ['harness', 'link', 'listening', 'lockstep', 'player']

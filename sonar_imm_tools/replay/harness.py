@@ -117,31 +117,21 @@ def run_lockstep(
             arguments = _arguments(bag, name, fed, params_file)
             for entry in fed.values():
                 arguments += _losing_nothing(f'{entry.makes}.publisher')
-            before = stack.enter_context(
-                NodeProcess(
-                    name, domain_id=domain, arguments=arguments, module=f'sonar_imm.nodes.{name}'
-                )
+            process = NodeProcess(
+                name, domain_id=domain, arguments=arguments, module=f'sonar_imm.nodes.{name}'
             )
+            before = stack.enter_context(process)
             first = FirstStep(link, f'/{name}', trouble=before.trouble)
             lockstep = Chain(first, last, {f'/{entry.name}' for entry in fed.values()})
-        player = Player(
-            bag,
-            link,
-            PlayOptions(
-                topics=tuple(inputs),
-                lockstep=f'/{system}',
-                remap={name: entry.full_name(system) for name, entry in inputs.items()},
-            ),
-            lockstep,
-        )
+        remap = {name: entry.full_name(system) for name, entry in inputs.items()}
+        options = PlayOptions(topics=tuple(inputs), lockstep=f'/{system}', remap=remap)
+        player = Player(bag, link, options, lockstep)
         player.run(progress, START_LIMIT)
         exit_code, log = node.stop(), node.log()
         if before is not None:
             exit_code, log = before.stop() or exit_code, log + before.log()
-        result = player.result()
-        return LockstepResult(
-            recorder.estimates(), lockstep.counts, result.delays, exit_code, log, result.problems
-        )
+        played, made = player.result(), (recorder.estimates(), lockstep.counts)
+        return LockstepResult(*made, played.delays, exit_code, log, played.problems)
 
 
 class NodeProcess:
@@ -165,19 +155,10 @@ class NodeProcess:
         # inherits the mask, and lifts it when it takes its signals.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
         try:
+            command = [sys.executable, '-m', module or SYSTEMS[system].node]
+            command += ['--ros-args', '-r', f'__node:={system}', *arguments]
             self.process = subprocess.Popen(
-                [
-                    sys.executable,
-                    '-m',
-                    module or SYSTEMS[system].node,
-                    '--ros-args',
-                    '-r',
-                    f'__node:={system}',
-                    *arguments,
-                ],
-                env=environment,
-                stdout=self._log,
-                stderr=subprocess.STDOUT,
+                command, env=environment, stdout=self._log, stderr=subprocess.STDOUT
             )
         finally:
             try:
@@ -206,9 +187,9 @@ class NodeProcess:
         tail = ' | '.join(self.log().splitlines()[-_LOG_TAIL:])
         return f"node '/{self.system}' ended with exit code {code}: {tail or 'no word'}"
 
-    def stop(self, how: signal.Signals = signal.SIGINT) -> int:
+    def stop(self) -> int:
         """Ask the node to stop, then insist; gives its exit code."""
-        for request in (how, signal.SIGTERM, signal.SIGKILL):
+        for request in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             if self.process.poll() is None:
                 self.process.send_signal(request)
                 with contextlib.suppress(subprocess.TimeoutExpired):

@@ -11,7 +11,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 import time
 
 from attrs import frozen
@@ -34,8 +35,7 @@ _DEPTH = 50
 
 @frozen(eq=False)
 class ReceivedTable:
-    """One message of a table: its columns by name, (rows,) or (rows, count), or the sentence why
-    it is none."""
+    """One message of a table: columns by name, (rows,) or (rows, count), or why it is none."""
 
     topic: str
     stamp_ns: int = 0
@@ -79,7 +79,9 @@ class TableListener:
     def _look(self) -> None:
         """Subscribe to what is there now and was not."""
         for name, types in self._link.node.get_topic_names_and_types():
-            wanted = name in self._wanted if self._wanted else self._is_meant(name, types)
+            parts = name.split('/')
+            ours = parts[-1] == 'estimate' and 'truth' not in parts and TABLE in types
+            wanted = name in self._wanted if self._wanted else ours
             if not wanted or name in self._subscriptions:
                 continue
             if TABLE not in types:
@@ -87,24 +89,16 @@ class TableListener:
                     f'{name} is of type {types[0]} and no table; ros2 topic echo {name} shows it'
                 )
             self._subscriptions[name] = self._link.node.create_subscription(
-                PointCloud2, name, self._reader(name), input_qos(_DEPTH)
+                PointCloud2, name, partial(self._take, name), input_qos(_DEPTH)
             )
 
-    def _reader(self, name: str) -> Callable[[PointCloud2], None]:
-        def take(message: PointCloud2) -> None:
-            try:
-                self._received.append(
-                    ReceivedTable(
-                        topic=name,
-                        stamp_ns=stamp_ns(message),
-                        frame_id=str(message.header.frame_id),
-                        columns=decode_table(message),
-                    )
-                )
-            except Rejection as rejection:
-                self._received.append(ReceivedTable(topic=name, problem=rejection.sentence))
-
-        return take
+    def _take(self, name: str, message: PointCloud2) -> None:
+        try:
+            columns, frame_id = decode_table(message), str(message.header.frame_id)
+            table = ReceivedTable(name, stamp_ns(message), frame_id, columns)
+        except Rejection as rejection:
+            table = ReceivedTable(topic=name, problem=rejection.sentence)
+        self._received.append(table)
 
     def _silence(self, timeout: float) -> str:
         there = self._link.node.get_topic_names_and_types()
@@ -123,7 +117,3 @@ class TableListener:
 
     def _publishers(self, name: str) -> int:
         return int(self._link.node.count_publishers(name))
-
-    def _is_meant(self, name: str, types: list[str]) -> bool:
-        parts = name.split('/')
-        return parts[-1] == 'estimate' and 'truth' not in parts and TABLE in types

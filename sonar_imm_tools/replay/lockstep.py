@@ -139,11 +139,11 @@ class LockStep:
                 f"no answer from a node '{self._name}': is it running, in this ROS "
                 'domain, and one of this package?'
             )
-        topics = {p.topic_name for p in publishers}
+        node, topics = self._link.node, {p.topic_name for p in publishers}
         hearing: set[str] = set()
         last = time.monotonic()
 
-        def connected() -> bool:
+        def connected() -> object:
             nonlocal last
             if fresh := self._subscribed(publishers) - hearing:
                 hearing.update(fresh)
@@ -152,7 +152,7 @@ class LockStep:
                 bool(hearing)
                 and (hearing == topics or time.monotonic() - last > _OTHER_INPUTS)
                 and all(p.get_subscription_count() for p in publishers if p.topic_name in hearing)
-                and self._recorded()
+                and (self._recorder is None or node.count_publishers(f'{self._name}/estimate'))
             )
 
         if not self._link.wait_for(connected, MATCH_LIMIT, self._trouble):
@@ -168,9 +168,8 @@ class LockStep:
         self.follow(1, publisher.topic_name, sent)
 
     def follow(self, messages: int, topic: str, sent: float) -> None:
-        """Wait for the answers to `messages` that were published for the node because of what went
-        out on `topic` at `sent`, in seconds of `time.monotonic`. Raises `LinkError` without
-        one."""
+        """Wait for the answers to so many `messages`, published for the node because of what went
+        out on `topic` at `sent`, s of `time.monotonic`. Raises `LinkError` without one."""
         self._sent += messages
         if not self.wait_for(self._caught_up, ANSWER_LIMIT):
             raise LinkError(
@@ -221,11 +220,6 @@ class LockStep:
             self._recorder is None or len(self._recorder) >= self.counts.estimates
         )
 
-    def _recorded(self) -> bool:
-        return self._recorder is None or bool(
-            self._link.node.count_publishers(f'{self._name}/estimate')
-        )
-
     def _lost(self) -> str | None:
         if sentence := self._trouble():
             return sentence
@@ -238,17 +232,17 @@ class LockStep:
         return {
             p.topic_name
             for p in publishers
-            if any(
-                _full_name(info) == self._name
-                for info in self._link.node.get_subscriptions_info_by_topic(p.topic_name)
-            )
+            for info in self._link.node.get_subscriptions_info_by_topic(p.topic_name)
+            if _full_name(info) == self._name
         }
 
     def _silence(self, publishers: list[Publisher], hearing: set[str]) -> str:
         """Say why no topic of the bag reaches the node."""
         for publisher in publishers:
             for info in self._link.node.get_subscriptions_info_by_topic(publisher.topic_name):
-                wanted, offered = info.topic_type, _type_name(publisher)
+                kind: Any = publisher.msg_type
+                offered = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+                wanted = info.topic_type
                 if _full_name(info) == self._name and wanted != offered:
                     return (
                         f"node '{self._name}' expects {wanted} on {publisher.topic_name}, the "
@@ -303,10 +297,10 @@ class Chain:
     def connect(self, publishers: Iterable[Publisher], limit: float = MATCH_LIMIT) -> set[str]:
         """As `LockStep.connect`, for both nodes and for what one sends to the other."""
         publishers = list(publishers)
-        connected = self.first.connect([p for p in publishers if p.topic_name in self._fed], limit)
-        connected |= self.second.connect(
-            [p for p in publishers if p.topic_name not in self._fed], limit
-        )
+        fed = [p for p in publishers if p.topic_name in self._fed]
+        connected = self.first.connect(fed, limit)
+        rest = [p for p in publishers if p.topic_name not in self._fed]
+        connected |= self.second.connect(rest, limit)
         if not self.first.wait_for(lambda: self.first.listeners):
             raise LinkError('the second node does not hear what the first one makes')
         return connected
@@ -325,9 +319,3 @@ class Chain:
 
 def _full_name(info: Any) -> str:
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-
-
-def _type_name(publisher: Publisher) -> str:
-    message_type: Any = publisher.msg_type
-    package, _, name = message_type.__module__.partition('.')
-    return f'{package}/msg/{message_type.__name__}'

@@ -166,9 +166,8 @@ class Player:
         named = (*options.topics, *options.exclude_topics, *options.remap, *options.qos)
         for name in named:
             if name not in recorded:
-                raise ConfigError(
-                    f"{self._bag.path} has no topic '{name}'{did_you_mean(name, recorded)}"
-                )
+                meant = did_you_mean(name, recorded)
+                raise ConfigError(f"{self._bag.path} has no topic '{name}'{meant}")
         # Reliable, which every listener accepts; in lock-step nothing may be dropped at all.
         qos = lockstep_qos() if self._options.lockstep else output_qos(_DEPTH)
         publishers = {}
@@ -198,13 +197,13 @@ class Player:
         publishers = self._publishers.values()
         if self._lockstep:
             return self._lockstep.connect(publishers, limit)
-        if not self._link.wait_for(
-            lambda: any(p.get_subscription_count() for p in publishers), _FIRST_LISTENER
-        ):
+
+        def heard() -> list[bool]:
+            return [p.get_subscription_count() > 0 for p in publishers]
+
+        if not self._link.wait_for(lambda: any(heard()), _FIRST_LISTENER):
             self._problems.append('nobody was listening when playing began')
-        self._link.wait_for(
-            lambda: all(p.get_subscription_count() for p in publishers), _OTHER_LISTENERS
-        )
+        self._link.wait_for(lambda: all(heard()), _OTHER_LISTENERS)
         return set()
 
     def _play_once(self, stepped: set[str], progress: Callable[[int], None]) -> None:
@@ -284,10 +283,9 @@ class Ticker:
         if self.until_next() > 0.0 and not always:
             return
         self._next = time.monotonic() + self._period
-        seconds, nanoseconds = divmod(now_ns, _NANO)
-        self._publisher.publish(
-            Clock(clock=make('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds))
-        )
+        seconds, rest = divmod(now_ns, _NANO)
+        clock = make('builtin_interfaces/msg/Time', sec=seconds, nanosec=rest)
+        self._publisher.publish(Clock(clock=clock))
 
 
 class Pause:

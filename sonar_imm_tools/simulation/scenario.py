@@ -6,8 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What the scenes of all systems share: how their parameters are named, when they begin, and noise
-that lasts."""
+"""What the scenes of all systems share: their parameters, when they begin, noise that lasts."""
 
 from __future__ import annotations
 
@@ -18,6 +17,7 @@ from typing import Any, ClassVar, TypeVar
 from attrs import frozen
 import numpy as np
 from numpy.random import Generator
+from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
 from sonar_imm.estimation.arrays import FloatArray
@@ -70,10 +70,9 @@ def stamps_of(seconds: FloatArray) -> np.ndarray:
     return FIRST_STAMP_NS + np.round(seconds * 1e9).astype(np.int64)
 
 
-def delay_ns(config: Any, rng: Generator) -> int:
-    """By how much a scan is received late: most are not."""
-    late = config.late_delay * rng.uniform() if rng.uniform() < config.late_fraction else 0.0
-    return nanoseconds(late)
+def delay_ns(config: Any, longest: float, rng: Generator) -> int:
+    """By how much a scan is received late, `longest` s at the most: most are not."""
+    return nanoseconds(longest * rng.uniform() if rng.uniform() < config.late_fraction else 0.0)
 
 
 def lasting(white: FloatArray, keep: float) -> FloatArray:
@@ -82,3 +81,12 @@ def lasting(white: FloatArray, keep: float) -> FloatArray:
     white = white.copy()
     white[1:] *= math.sqrt(1.0 - keep * keep)
     return np.asarray(lfilter([1.0], [1.0, -keep], white, axis=0))
+
+
+def smoothed(white: FloatArray, width: float) -> FloatArray:
+    """White noise (n, ...) of unit variance, smoothed over `width` samples to unit variance."""
+    impulse = np.zeros(len(white))
+    impulse[len(white) // 2] = 1.0
+    kernel = gaussian_filter1d(impulse, width, mode='wrap')
+    smooth = gaussian_filter1d(white, width, axis=0, mode='wrap')
+    return np.asarray(smooth / np.linalg.norm(kernel))

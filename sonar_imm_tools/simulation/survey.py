@@ -12,7 +12,8 @@
 Nothing here uses the first-order formulas of `sonar_imm_tools.survey`, which it tests: poses are
 rotations, and sound goes in two straight pieces through two layers of water. The tracker is taken
 to know the speed of sound in the upper third of the column, where the array is, and to suppose the
-same below, where it is wrong. A correction is the true value less the reported one.
+same below, where it is wrong. A correction is the true value less the reported one. In one file,
+with the parameters, whose texts are a part of it.
 """
 
 from __future__ import annotations
@@ -31,11 +32,12 @@ from sonar_imm.acoustics.geometry import rotation
 from sonar_imm.acoustics.sounding import ErrorBudget, uncertainties
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.parameters import parameter
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm.truth import Received, Scene
 
 from ..recordings.export.points import Points
 from .bathymetry.ship import navigation_of, Ship, ship_of, Terrain, Waves
-from .bathymetry.simulator import BathymetryScenario, hear, profile_below
+from .bathymetry.simulator import BathymetryScenario, floor_below, hear, look_of
 from .scenario import FIRST_STAMP_NS, lasting, Scenario, Scenarios
 
 TERRAINS = ('survey', 'flat', 'slope')
@@ -152,10 +154,10 @@ def _plan(
     """The floor, start, course and length of each line, and the corrections (L, 6)."""
     width = (config.lines - 1) * config.spacing
     floor = _floor(config, width, rng)
-    starts = [
-        ((0.0, k * config.spacing), 0.0 if k % 2 == 0 else math.pi) for k in range(config.lines)
-    ]
-    lines = [((config.length if c else x, y), c, config.length) for (x, y), c in starts]
+    lines: list[tuple[tuple[float, float], float, float]] = []
+    for k in range(config.lines):  # there and back
+        start, course = (config.length, math.pi) if k % 2 else (0.0, 0.0)
+        lines.append(((start, k * config.spacing), course, config.length))
     for k in range(config.cross_lines):
         x = config.length * (k + 1) / (config.cross_lines + 1)
         lines.append(((x, -0.5 * config.spacing), 0.5 * math.pi, width + config.spacing))
@@ -237,12 +239,10 @@ def _swaths(
     first_ns: int,
     rng: Generator,
 ) -> Scene:
-    """Pings and navigation of a line."""
     ship = ship_of(sonar, sonar.sonar_depth, rng)
     ship = ship._replace(start=ship.start + [*start, 0.0])
-    ground = _Ground(
-        -KEEL - sonar.sonar_height, ship.course, floor.at, lambda along, off: off > np.inf
-    )
+    level = -KEEL - sonar.sonar_height
+    ground = _Ground(level, ship.course, floor.at, lambda along, off: off > np.inf)
     count = round((sonar.last_range - sonar.first_range) / sonar.bin_width)
     ranges = sonar.first_range + sonar.bin_width * np.arange(count, dtype=np.float64)
     heard = round(2e9 * ranges[-1] / SOUND_SPEED)
@@ -250,14 +250,13 @@ def _swaths(
     for ping in range(sonar.pings):
         sent = ping / sonar.ping_rate
         for side in ('port', 'starboard'):
-            profile = profile_below(
-                sonar, ship, ground, np.zeros(count), first_ns, sent, ranges, side, side
-            )
+            look = look_of(sonar, ship, sent, ranges, side)
+            profile = floor_below(sonar, look, ground, np.zeros(count), ranges)
+            profile = evolve(profile, stamp_ns=first_ns + round(sent * 1e9), namespace=side)
             truth.append(profile)
             received.append(Received(profile.stamp_ns + heard, hear(sonar, profile, rng), side))
-    stated = navigation_of(
-        sonar, _as_reported(ship, correction), first_ns, sonar.pings / sonar.ping_rate, rng, 'map'
-    )
+    reported, seconds = _as_reported(ship, correction), sonar.pings / sonar.ping_rate
+    stated = navigation_of(sonar, reported, first_ns, seconds, rng, 'map')
     received += [Received(each.stamp_ns, each) for each in stated]
     received.sort(key=lambda item: item.received_ns)
     return Scene(tuple(received), tuple(truth), frame_id='map')
@@ -298,13 +297,7 @@ def write_truth(path: Path, scene: SurveyScene) -> None:
 
 def budget() -> ErrorBudget:
     """The errors that a tracker supposes by default, and that the scene has."""
-    return ErrorBudget(
-        attitude=math.radians(0.05),
-        heading=math.radians(0.1),
-        heave=0.05,
-        position=0.1,
-        sound_speed=0.5,
-    )
+    return BathymetryConfig().budget()
 
 
 def _floor(config: SurveyScenario, width: float, rng: Generator) -> Floor:
@@ -334,7 +327,6 @@ def _floor(config: SurveyScenario, width: float, rng: Generator) -> Floor:
 def _add_ellipsoid(
     z: FloatArray, x: FloatArray, y: FloatArray, place: FloatArray, axes: FloatArray
 ) -> None:
-    """Put half an ellipsoid on the floor."""
     i = slice(*np.searchsorted(x, [place[0] - axes[0], place[0] + axes[0]]))
     j = slice(*np.searchsorted(y, [place[1] - axes[1], place[1] + axes[1]]))
     u = (x[i, None] - place[0]) / axes[0]
@@ -354,11 +346,11 @@ def _line(
 ) -> Points:
     t = np.arange(0.0, length / config.speed, config.ping_interval)
     errors = budget()
-    slow = {
-        name: config.nav_errors * _slow(rng, t, SECONDS[name]) for name in ('heave', 'heading')
-    }
-    attitude = [config.nav_errors * _slow(rng, t, SECONDS['attitude']) for _ in range(2)]
-    position = [config.nav_errors * _slow(rng, t, SECONDS['position']) for _ in range(2)]
+    heave, heading, *others = (
+        config.nav_errors * _slow(rng, t, SECONDS[name])
+        for name in ('heave', 'heading', 'attitude', 'attitude', 'position', 'position')
+    )
+    attitude, position = others[:2], others[2:]
     roll = math.radians(2.0) * np.sin(2.0 * math.pi * t / 7.0 + rng.uniform(0.0, 6.0))
     pitch = math.radians(1.0) * np.sin(2.0 * math.pi * t / 5.5 + rng.uniform(0.0, 6.0))
     yaw = course + math.radians(0.8) * np.sin(2.0 * math.pi * t / 12.0 + rng.uniform(0.0, 6.0))
@@ -368,11 +360,11 @@ def _line(
     reported_place = place.copy()
     reported_place[:, :2] -= corrections[5] * config.speed * ahead
     reported_place[:, :2] -= errors.position * np.column_stack(position)
-    reported_place[:, 2] -= corrections[3] + errors.heave * slow['heave']
+    reported_place[:, 2] -= corrections[3] + errors.heave * heave
     reported = rotation(
         roll - corrections[0] - errors.attitude * attitude[0],
         pitch - corrections[1] - errors.attitude * attitude[1],
-        yaw - corrections[2] - errors.heading * slow['heading'],
+        yaw - corrections[2] - errors.heading * heading,
     )
     true = rotation(roll, pitch, yaw)
     # Beams evenly along the floor, on both sides.
@@ -388,9 +380,8 @@ def _line(
     own = _along_swath(rng, len(t), config.beams) * config.noise
     xyz[..., 2] += own
     D, Y = -slant * stated[..., 2], slant * np.hypot(stated[..., 0], stated[..., 1])
-    vertical, horizontal = uncertainties(
-        np.full(D.shape, config.noise**2), D, Y, errors, SOUND_SPEED
-    )
+    noise = np.full(D.shape, config.noise**2)
+    vertical, horizontal = uncertainties(noise, D, Y, errors, SOUND_SPEED)
     whole = np.broadcast_to(angle, D.shape)
     level = np.arccos(np.clip(-stated[..., 2], -1.0, 1.0)) * np.sign(whole)
     found = np.isfinite(xyz).all(axis=-1)

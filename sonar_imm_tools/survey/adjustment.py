@@ -23,7 +23,8 @@ depth; along a line that goes with its gradients, and was taken for heading. Bes
     C = N^-1 (J' M V M J + J' M U S U' M J + P) N^-1,
 
 J the partials, M the weights after elimination, V the variances of looks, U the blocks with their
-budget S, P the prior information. The larger standard deviation of both is published.
+budget S, P the prior information. The larger standard deviation of both is published. In one file,
+since it is one estimate.
 """
 
 from __future__ import annotations
@@ -144,8 +145,7 @@ class Adjustment:
 
 @frozen(eq=False)
 class Rounds:
-    """What the first R rounds have solved: the rms of looks before each (R,), and the unknowns
-    (P,) after the last."""
+    """What R rounds have solved: rms of looks before each (R,), unknowns (P,) after the last."""
 
     rms: FloatArray
     value: FloatArray
@@ -299,8 +299,7 @@ class Mistie:
 
 
 def misties(lines: Sequence[Looks]) -> tuple[dict[tuple[int, int], Mistie], int]:
-    """By the numbers of each pair of lines that share cells, first less second; and how many cells
-    two lines or more see."""
+    """By pairs of lines that share cells, first less second; how many cells several lines see."""
     keys, apart = [], []
     cells = 0
     for found in crossings(lines):
@@ -322,10 +321,8 @@ def misties(lines: Sequence[Looks]) -> tuple[dict[tuple[int, int], Mistie], int]
     starts, _, _ = runs_of(key[order])
     pairs = [divmod(pair, 1 << 32) for pair in key[order[starts]].tolist()]
     each = np.split(d[order], starts[1:])
-    return {
-        pair: Mistie(len(own), float(np.median(own)), robust_rms(own))
-        for pair, own in zip(pairs, each)
-    }, cells
+    made = (Mistie(len(own), float(np.median(own)), robust_rms(own)) for own in each)
+    return dict(zip(pairs, made)), cells
 
 
 def robust_rms(values: FloatArray) -> float:
@@ -397,18 +394,15 @@ class _Equations:
         pointers = np.arange(0, m * (k + 3) + 1, k + 3)
         return csr_array((values.ravel(), columns.ravel(), pointers), shape=(m, len(known.owner)))
 
-    def _off_cell(self, z: FloatArray) -> FloatArray:
-        mean = (self.in_cell @ (self.w * z)) / (self.in_cell @ self.w)
-        return np.asarray(z - mean[self.cell])
-
     def reweight(self, J: csr_array, value: FloatArray) -> None:
         """Student weights of the residuals at a solution for the unknowns of J."""
-        u = self._off_cell(self.y + J @ value) / np.sqrt(self.v)
+        z = self.y + J @ value
+        mean = (self.in_cell @ (self.w * z)) / (self.in_cell @ self.w)
+        u = (z - mean[self.cell]) / np.sqrt(self.v)
         self.w = (NU + 1.0) / (NU + np.square(u)) / self.v
 
     def normal(self, J: csr_array) -> tuple[csc_array, FloatArray]:
-        """Information (k, k) and right-hand side (k,) of the unknowns of J, heights of cells
-        eliminated."""
+        """Information (k, k) and right-hand side (k,) for J, heights of cells eliminated."""
         WJ = diags_array(self.w) @ J
         K = (self.in_cell @ WJ).tocsr()
         weight = self.in_cell @ self.w
@@ -435,26 +429,23 @@ class _Equations:
         found, block = np.unique(key, return_inverse=True)
         return block, len(found)
 
-    def _affordable(self) -> float:
-        """Seconds of a block with which the unknowns are few enough, 0 for none."""
-        seconds = BLOCK_SECONDS
-        while 2 * self._blocks(seconds)[1] + len(self.unknowns.owner) > MOST_UNKNOWNS:
-            seconds *= 2.0
-            if seconds > LONGEST_BLOCK:
-                return 0.0
-        return seconds
-
     def _system(self, states: bool) -> tuple[csr_array, FloatArray]:
         """Columns of all unknowns, states last, and their prior information."""
         prior = 1.0 / np.square(self.unknowns.prior_std)
         if not states:
             return self.J, prior
-        columns, information = self.states(self._affordable())
+        # With such blocks the unknowns are few enough; none where that would take too long ones.
+        seconds = BLOCK_SECONDS
+        while 2 * self._blocks(seconds)[1] + len(self.unknowns.owner) > MOST_UNKNOWNS:
+            seconds *= 2.0
+            if seconds > LONGEST_BLOCK:
+                seconds = 0.0
+                break
+        columns, information = self.states(seconds)
         return hstack([self.J, columns]).tocsr(), np.concatenate([prior, information])
 
     def solve(self, states: bool, start: FloatArray) -> FloatArray:
-        """The unknowns (P,), by iterated Student weights, from those of the round before; 0 in the
-        first one."""
+        """The unknowns (P,), by iterated Student weights, from those of the round before or 0."""
         J, prior = self._system(states)
         size = len(start)
         value = np.concatenate([start, np.zeros(len(prior) - size)])
@@ -555,33 +546,23 @@ def _factored(
 def described(adjustment: Adjustment, names: Sequence[str]) -> dict[str, Any]:
     """The parameters, what could not be told, and levels, as adjustment.json has them."""
 
-    def label(k: int) -> tuple[str, str]:
-        owner = int(adjustment.owner[k])
-        return names[owner] if owner >= 0 else '', UNITS[adjustment.kind[k]]
-
-    known, scale = adjustment.known_share(), SCALE[adjustment.kind]
-    parameters = [
-        {
-            'line': label(k)[0],
-            'name': label(k)[1],
-            'value': float(adjustment.value[k] * scale[k]),
-            'std': float(adjustment.std[k] * scale[k]),
-            'prior_std': float(adjustment.prior_std[k] * scale[k]),
-            'told': float(known[k]),
-        }
-        for k in range(len(scale))
-    ]
+    scale = SCALE[adjustment.kind]
+    lines = [names[owner] if owner >= 0 else '' for owner in adjustment.owner.tolist()]
+    columns = {
+        'line': lines,
+        'name': [UNITS[kind] for kind in adjustment.kind],
+        'value': (adjustment.value * scale).tolist(),
+        'std': (adjustment.std * scale).tolist(),
+        'prior_std': (adjustment.prior_std * scale).tolist(),
+        'told': adjustment.known_share().tolist(),
+    }
+    parameters = [dict(zip(columns, row)) for row in zip(*columns.values())]
+    labels = [' '.join(filter(None, (row['name'], row['line']))) for row in parameters]
     combinations = []
     for vector, share in adjustment.not_known():
-        largest = np.argsort(-np.abs(vector), kind='stable')[:6]
-        words = [
-            f'{vector[k]:+.2f} {" ".join(filter(None, reversed(label(k))))}'
-            for k in largest.tolist()
-            if abs(vector[k]) > 0.05
-        ]
+        largest = np.argsort(-np.abs(vector), kind='stable')[:6].tolist()
+        words = [f'{vector[k]:+.2f} {labels[k]}' for k in largest if abs(vector[k]) > 0.05]
         combinations.append({'combination': ' '.join(words), 'share': share})
-    levels = [
-        {'lines': [names[k] for k in lines.tolist()], 'std_m': std}
-        for lines, std in adjustment.levels()
-    ]
+    groups = adjustment.levels()
+    levels = [{'lines': [names[k] for k in lines], 'std_m': std} for lines, std in groups]
     return {'parameters': parameters, 'not_told': combinations, 'levels': levels}

@@ -120,11 +120,9 @@ def grid_of_looks(
     x0, y0, columns, rows = box
     # Nodes around the box are needed for the medians of the second pass.
     around = (x0 - 2, y0 - 2, columns + 4, rows + 4)
-    near = soundings.line.xy / cell
-    within = np.all(
-        (near >= np.array([x0, y0]) - HALO) & (near < np.array([x0 + columns, y0 + rows]) + HALO),
-        axis=1,
-    )
+    near, low = soundings.line.xy / cell, np.array([x0, y0]) - HALO
+    high = np.array([x0 + columns, y0 + rows]) + HALO
+    within = np.all((near >= low) & (near < high), axis=1)
     if not within.all():
         soundings = soundings.chosen(within)
     which, node, d = _pairs(soundings.line.xy, cell, around)
@@ -148,17 +146,17 @@ def grid_of_looks(
 
 
 def tiles_of(
-    soundings: Soundings, cell: float, size: int = 256
+    soundings: Soundings, cell: float
 ) -> Iterator[tuple[tuple[int, int, int, int], Soundings]]:
-    """Boxes of size x size cells that hold soundings, each with those it needs."""
+    """Boxes of 256 x 256 cells that hold soundings, each with those it needs."""
+    size = 256
     index = np.floor(soundings.line.xy / cell).astype(np.int64)
     order = np.argsort(index[:, 0], kind='stable')
     column = index[order, 0]
     tiles = np.unique(index // size, axis=0)
     for tx in np.unique(tiles[:, 0]).tolist():
-        first, last = np.searchsorted(
-            column, [tx * size - HALO, (tx + 1) * size + HALO], side='left'
-        )
+        ends = tx * size - HALO, (tx + 1) * size + HALO
+        first, last = np.searchsorted(column, ends, side='left')
         strip = np.sort(order[first:last])
         row = index[strip, 1]
         for ty in tiles[tiles[:, 0] == tx, 1].tolist():

@@ -43,10 +43,8 @@ TILE = 64
 """Cells along the side of a tile."""
 LONGEST_SECONDS = 1800.0
 """A longer line has more than one tide."""
-_STORED = dict.fromkeys(('D', 'Y', 'noise', 'geometry', 'speed', 'port'), 'f4') | {
-    's': 'i1',
-    'label': 'u1',
-}
+_FLOATS = ('D', 'Y', 'noise', 'geometry', 'speed', 'port')
+_STORED = dict.fromkeys(_FLOATS, 'f4') | {'s': 'i1', 'label': 'u1'}
 
 
 @frozen(kw_only=True)
@@ -111,14 +109,14 @@ class Unit:
     depth: float
 
 
-# -- jobs of lines -------------------------------------------------------------------------------
-
-
 def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]:
     """Read a line and keep its soundings at `place` (a path without ending), in pieces of half an
     hour; gives what survey.json says of it. Nothing is read again when size and time, or the
     content, are those of before. Raises `BagError`."""
-    size, mtime_ns = _stat(source.table)
+    table = source.table
+    files = [table] if table.is_file() else [item for item in table.rglob('*') if item.is_file()]
+    stats = [file.stat() for file in files]
+    size, mtime_ns = sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)
     budget, sound_speed = budget_of(source.run)
     own, frame = origin_of(source.run, source.name), options.frame
     if own is None and frame and not any(options.origin):
@@ -140,9 +138,8 @@ def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]
             return dict(known['info'])
         if known['info']['sha256'] == fingerprint(source.table)['bag_sha256']:
             return dict(known['info'])
-    points = read_points(source.table).placed(
-        own, options.epsg, options.origin, frame and Origin(*frame)
-    )
+    there = frame and Origin(*frame)
+    points = read_points(source.table).placed(own, options.epsg, options.origin, there)
     if not len(points):
         raise BagError(f'{source.table} has no soundings')
     used = ('x', 'y', 'z', 'vertical_uncertainty', 'range', 'beam_angle', 'side')
@@ -153,10 +150,10 @@ def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]
     count = max(1, math.ceil(seconds / LONGEST_SECONDS))
     edges = line.stamp_ns[0] + (np.arange(1, count) * seconds / count * 1e9).astype(np.int64)
     place.with_suffix('.json').unlink(missing_ok=True)
-    for k, rows in enumerate(
-        np.split(np.arange(len(line)), np.searchsorted(line.stamp_ns, edges))
-    ):
-        _store(place.with_name(f'{place.name}-{k}.npz'), line.chosen(rows))
+    pieces = np.split(np.arange(len(line)), np.searchsorted(line.stamp_ns, edges))
+    for k, rows in enumerate(pieces):
+        piece = {'table': _table(_columns(line.chosen(rows))), 'sound_speed': line.sound_speed}
+        save_arrays(place.with_name(f'{place.name}-{k}.npz'), piece)
     info |= {
         'sha256': fingerprint(source.table)['bag_sha256'],
         'soundings': len(line),
@@ -210,14 +207,9 @@ def tile_line(
     rows = {}
     for k in np.unique(of_tile[of_tile < len(tiles)]).tolist():
         rows[tiles[k].name] = tuple(np.searchsorted(of_tile, [k, k + 1]).tolist())
-    write_json(
-        place.with_suffix('.json'),
-        {'signature': signature, 'rows': rows, 'sound_speed': line.sound_speed},
-    )
+    content = {'signature': signature, 'rows': rows, 'sound_speed': line.sound_speed}
+    write_json(place.with_suffix('.json'), content)
     return rows
-
-
-# -- jobs of tiles -------------------------------------------------------------------------------
 
 
 @frozen(kw_only=True)
@@ -260,9 +252,6 @@ def make_tile(job: TileJob) -> None:
     write_json(job.place.with_suffix('.json'), job.signature)
 
 
-# -- files below .work ---------------------------------------------------------------------------
-
-
 def _table(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Columns (n, ...) as one array of rows."""
     fields: list[Any] = [(k, v.dtype, v.shape[1:]) for k, v in columns.items()]
@@ -281,7 +270,6 @@ def _save_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
 
 
 def _columns(line: Line) -> dict[str, np.ndarray]:
-    """The columns of a line as they are kept."""
     columns = {name: getattr(line, name) for name in ('stamp_ns', 'xy', 'z')}
     return columns | {k: getattr(line, k).astype(kind) for k, kind in _STORED.items()}
 
@@ -294,17 +282,6 @@ def _line(table: np.ndarray, sound_speed: float) -> Line:
         for name in table.dtype.names or ()
     }
     return Line(**columns, sound_speed=sound_speed)
-
-
-def _store(path: Path, line: Line) -> None:
-    save_arrays(path, {'table': _table(_columns(line)), 'sound_speed': line.sound_speed})
-
-
-def _stat(path: Path) -> tuple[int, int]:
-    """Size and time of a file, or of all files of a bag."""
-    files = [path] if path.is_file() else [item for item in path.rglob('*') if item.is_file()]
-    stats = [file.stat() for file in files]
-    return sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
 
 
 def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:

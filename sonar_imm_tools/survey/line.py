@@ -49,16 +49,10 @@ LEAST_NOISE = 0.01**2
 SLACK = 10.0
 """Metres by which a sounding may lie farther from the middle of its ping than ranges reach."""
 STATED = (
-    'attitude_std_deg',
-    'heading_std_deg',
-    'heave_std',
-    'position_std',
-    'sound_speed_std',
+    'attitude_std_deg', 'heading_std_deg', 'heave_std', 'position_std', 'sound_speed_std',
     'sound_speed',
-)
+)  # fmt: skip
 """Parameters of a run that a survey uses."""
-
-
 R = TypeVar('R', bound='Rows')
 
 
@@ -129,16 +123,9 @@ class Line(Rows):
         side = self.s * self.Y
         depth = np.maximum(np.abs(self.D), 0.05 * np.hypot(self.D, self.Y) + 1e-6)
         bend = np.square(self.Y) / depth
-        return np.column_stack(
-            [
-                side,
-                (bend - depth) / self.sound_speed,
-                self.D[:, None] * self.port,
-                side[:, None] * self.port,
-                self.speed[:, None] * self.port,
-                0.5 * bend,
-            ]
-        )
+        sideways = [each[:, None] * self.port for each in (self.D, side, self.speed)]
+        water = (bend - depth) / self.sound_speed
+        return np.column_stack([side, water, *sideways, 0.5 * bend])
 
 
 def line_of(points: Points, budget: ErrorBudget, sound_speed: float = 1500.0) -> Line:
@@ -239,7 +226,12 @@ def budget_of(run: Mapping[str, Any] | None) -> tuple[ErrorBudget, float]:
         raise ConfigError('it has no parameters')
     if 'sound_speed' not in stated:
         raise ConfigError('its parameters lack sound_speed; track the recording again')
-    values = {name: _number(name, stated[name]) for name in STATED if name in stated}
+    values = {name: stated[name] for name in STATED if name in stated}
+    for name, value in values.items():
+        plain = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not (plain and abs(value) < 1e9):
+            raise ConfigError(f'its parameter {name} is not a finite number')
+        values[name] = float(value)
     config = BathymetryConfig.from_mapping(values)
     return config.budget(), config.sound_speed
 
@@ -248,14 +240,6 @@ def unstated(run: Mapping[str, Any] | None) -> list[str]:
     """Return the parameters of `STATED` for which `budget_of` takes the defaults."""
     stated = {} if run is None else run['parameters']
     return [name for name in STATED if name not in stated]
-
-
-def _number(name: str, value: Any) -> float:
-    """Return a parameter of run.json as a float. Raises `ConfigError`."""
-    plain = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not (plain and abs(value) < 1e9):
-        raise ConfigError(f'its parameter {name} is not a finite number')
-    return float(value)
 
 
 def partials(basis: FloatArray, g: FloatArray, sound_speed: float) -> FloatArray:
@@ -267,16 +251,9 @@ def partials(basis: FloatArray, g: FloatArray, sound_speed: float) -> FloatArray
     def along_f(k: int) -> FloatArray:
         return np.asarray(basis[:, k + 1] * g[:, 0] - basis[:, k] * g[:, 1])
 
-    return np.column_stack(
-        [
-            basis[:, 0] - along_l(2),
-            along_f(2),
-            along_f(4),
-            np.ones(len(basis)),
-            basis[:, 1] - 2.0 * along_l(4) / sound_speed,
-            -along_f(6),
-        ]
-    )
+    roll, water = basis[:, 0] - along_l(2), basis[:, 1] - 2.0 * along_l(4) / sound_speed
+    offset = np.ones(len(basis))
+    return np.column_stack([roll, along_f(2), along_f(4), offset, water, -along_f(6)])
 
 
 def common_variance(
@@ -317,13 +294,20 @@ def _directions(
     t_mean, p_mean = mean(t), mean(p)
     slope = mean((t - t_mean[ping])[:, None] * (p - p_mean[ping])) * n[:, None]
     seconds = (stamps - stamps[0]) * 1e-9
-    first, last = _around(seconds, DIRECTION_SECONDS)
+
+    def around(most: float) -> tuple[IntArray, IntArray]:
+        """First and one behind the last of the pings (P,) within `most` seconds of each."""
+        most += 1e-3
+        first = np.searchsorted(seconds, seconds - most, 'left')
+        return first, np.searchsorted(seconds, seconds + most, 'right')
+
+    first, last = around(DIRECTION_SECONDS)
     near = _windowed(slope, first, last)
     length = np.hypot(near[:, 0], near[:, 1])
     port = near / np.where(length > 0.0, length, 1.0)[:, None]
     keel = p_mean - t_mean[:, None] * port
     # Speed needs a ping before and one after, however far they are.
-    first, last = _around(seconds, SPEED_SECONDS)
+    first, last = around(SPEED_SECONDS)
     ping_number = np.arange(len(stamps))
     first = np.minimum(first, np.maximum(ping_number - 1, 0))
     last = np.maximum(last, np.minimum(ping_number + 2, len(stamps)))
@@ -336,13 +320,6 @@ def _directions(
     velocity = tk / np.where(known, tt, 1.0)[:, None] * known[:, None]
     speed = velocity[:, 0] * port[:, 1] - velocity[:, 1] * port[:, 0]
     return port[ping], speed[ping]
-
-
-def _around(seconds: FloatArray, most: float) -> tuple[IntArray, IntArray]:
-    """First and one behind the last of the pings (P,) within `most` seconds of each."""
-    most += 1e-3
-    first = np.searchsorted(seconds, seconds - most, 'left')
-    return first, np.searchsorted(seconds, seconds + most, 'right')
 
 
 def _windowed(values: FloatArray, first: IntArray, last: IntArray) -> FloatArray:

@@ -88,8 +88,7 @@ class Looks(Rows):
 def looks_of(line: Line, cell: float, number: IntArray | int = 0) -> Looks:
     """The looks of a line at cells of `cell` metres; number: of the line, or of each sounding's.
 
-    Members lie within three deviations of the median of the cell, by its scatter or their own
-    noise.
+    Members lie within three deviations of the median, by its scatter or their own noise.
     """
     index = np.floor(line.xy / cell).astype(np.int64)
     side = (line.s < 0.0).astype(np.int64)
@@ -226,8 +225,7 @@ def gradients(looks: Looks, ix: IntArray, iy: IntArray) -> FloatArray:
 
 
 def runs_of(*keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Of rows sorted by keys (n,): where each group of equal keys starts, how long it is, and the
-    group of each row."""
+    """Of rows sorted by keys (n,): start and length of groups of equal keys, group of each row."""
     n = len(keys[0])
     fresh = np.zeros(n, bool)
     fresh[:1] = True

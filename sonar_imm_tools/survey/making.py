@@ -10,7 +10,7 @@
 
 A job is a line or a tile, see `jobs`. The statistics of lines and the products of tiles are put
 together in this process, in the order of names and numbers: which process did what, and when it
-ended, changes no byte.
+ended, changes no byte. In one file, from the first look at the folders to the last tile.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from sonar_imm.files import marked
 from sonar_imm.parameters import ConfigError
 
 from ..evaluation.numbers import counted
-from ..offline.jobs import Run
+from ..offline.jobs import Calls, Run, Work
 from ..offline.run_folder import BAG, CSV, PARQUET, RUN, RunFolder, SOUNDINGS
 from ..offline.run_folder import KIND as RESULTS
 from ..recordings.export.points import origin_of, TOPIC, topics_of_soundings
@@ -69,9 +69,6 @@ LEAST_SOUNDINGS = 5.0
 STATISTICS_CELL = 2.0
 
 
-# -- which lines there are -----------------------------------------------------------------------
-
-
 def sources_of(runs: Path) -> list[Source]:
     """The lines below a folder, sorted by name: folders with a table of soundings, and recordings
     of `~/soundings` that are not of such a folder. Raises `BagError` for none."""
@@ -80,7 +77,11 @@ def sources_of(runs: Path) -> list[Source]:
     found: dict[Path, Path] = {}
     for name in (SOUNDINGS, PARQUET[SOUNDINGS]):  # the later one is read
         found |= {path.parent: path for path in sorted(runs.rglob(name)) if WORK not in path.parts}
-    for place in _recordings(runs):
+    # Bags, and files of bags that lie alone.
+    bags = {path.parent for path in runs.rglob('metadata.yaml')}
+    files = (path for path in runs.rglob('*') if is_recording(path) and path.is_file())
+    alone = {path for path in files if path.parent not in bags}
+    for place in sorted(path for path in bags | alone if WORK not in path.parts):
         # The bag of a run whose table is gone stands for it.
         bag = place if place.is_dir() else place.parent
         folder = bag.parent if bag.name == BAG and _is_results(bag.parent) else place
@@ -101,14 +102,6 @@ def sources_of(runs: Path) -> list[Source]:
         run, failure = _run_of(folder)
         sources.append(Source(name=name, folder=folder, table=table, run=run, failure=failure))
     return sorted(sources, key=lambda source: source.name)
-
-
-def _recordings(runs: Path) -> list[Path]:
-    """Bags below a folder, and files of bags that lie alone."""
-    bags = {path.parent for path in runs.rglob('metadata.yaml')}
-    files = (path for path in runs.rglob('*') if is_recording(path) and path.is_file())
-    alone = {path for path in files if path.parent not in bags}
-    return sorted(path for path in bags | alone if WORK not in path.parts)
 
 
 def _has_soundings(recording: Path) -> bool:
@@ -168,9 +161,6 @@ def frame_of(sources: Sequence[Source]) -> tuple[float, float, float] | None:
     return None
 
 
-# -- which tiles there are ----------------------------------------------------------------------
-
-
 @frozen(eq=False)
 class _Depths(Rows):
     """What cells of the statistics (m,) say of tiles: number of the cell, depth m, soundings."""
@@ -227,8 +217,7 @@ def plan_tiles(lines: Sequence[Looks], resolution: float) -> list[Tile]:
 
 
 def extent_of(tiles: Sequence[Tile]) -> tuple[float, float, float, int, int]:
-    """West, north, finest cell, rows and columns of the chart of tiles. Raises `BagError` for too
-    many cells."""
+    """West, north, finest cell, rows, columns of a chart. Raises `BagError` for too many cells."""
     cell = min(tile.cell for tile in tiles)
     corners = np.array([[t.i, t.j, t.i + 1, t.j + 1] for t in tiles]) * TILE
     corners = corners * np.array([[t.cell] for t in tiles])
@@ -242,9 +231,6 @@ def extent_of(tiles: Sequence[Tile]) -> tuple[float, float, float, int, int]:
     return low[0], high[1], cell, rows, columns
 
 
-# -- the survey ----------------------------------------------------------------------------------
-
-
 @frozen(kw_only=True)
 class Progress:
     """What hears of stages: `begin(what, total)` gives what hears of each that is done."""
@@ -252,6 +238,31 @@ class Progress:
     begin: Callable[[str, int], Callable[[int], None]]
     say: Callable[[str], None]
     warn: Callable[[str], None]
+
+
+@frozen
+class _Jobs:
+    """What runs jobs and hears of them, and the folder where they keep what they make."""
+
+    run: Run
+    progress: Progress
+    work: Path
+
+    def all(self, work: Work, calls: Calls, what: str, named: Sequence[Any]) -> list[Any]:
+        """What came of all calls, in order. Raises `BagError` naming the first that failed."""
+        results: list[Any] = [None] * len(calls)
+        failures: dict[int, str] = {}
+        advance = self.progress.begin(what, len(calls))
+        for k, result, failure in self.run(work, calls):
+            results[k] = result
+            if failure:
+                failures[k] = failure
+            advance(1)
+        if failures:
+            k = min(failures)
+            why = f'{failures[k]}; --resume makes what is missing'
+            raise BagError(f'{what}: {named[k].name}: {why}')
+        return results
 
 
 @frozen(kw_only=True)
@@ -284,9 +295,17 @@ def make(
     sources: Sequence[Source], out: Path, options: Options, run: Run, progress: Progress
 ) -> Survey:
     """Do all jobs; out: the folder of the survey, whose ``.work`` they fill. Raises `BagError`."""
-    work = out / WORK
-    units, lines, budget = _imported(sources, work, options, run, progress)
-    warnings = [*_unstated(sources, lines), *_far(lines)]
+    jobs = _Jobs(run, progress, out / WORK)
+    work = jobs.work
+    units, lines, budget = _imported(sources, options, jobs)
+    warnings = _unstated(sources, lines)
+    for line in lines:
+        if far := line['far']:
+            says = 'lies far away and is' if far == 1 else 'lie far away and are'
+            warnings.append(
+                f'{line["name"]}: {counted(far, "sounding")} {says} left out: no ship that sees '
+                'the others can have seen them'
+            )
     depth = float(np.median([unit.depth for unit in units]))
     coarse = options.resolution or 2.0 ** math.floor(math.log2(max(0.05 * depth, FINEST)))
     cell = max(STATISTICS_CELL, 2.0 * min(coarse, COARSEST))
@@ -296,41 +315,36 @@ def make(
         folder = work / ('adjusted' if corrections.any() else 'looks')
         places = [folder / f'{unit.file.stem}.npy' for unit in units]
         calls = [(unit, corrections[unit.number], cell, p) for unit, p in zip(units, places)]
-        _all(run, line_statistics, calls, progress, 'statistics', units)
+        jobs.all(line_statistics, calls, 'statistics', units)
         return KeptLooks(places, cell)
 
-    made_of = [unit.signature for unit in units], cell
+    made_of: tuple[Any, ...] = ([unit.signature for unit in units], cell)
     none = np.zeros((len(units), 6))
     looks = statistics(none)
-    before, cells, rms = find_misties(
-        looks, made_of, work / 'misties.json', rms=not options.adjusted
-    )
+    place = work / 'misties.json'
+    before, cells, rms = find_misties(looks, made_of, place, rms=not options.adjusted)
     found: Adjustment | None = None
     after: Misties = {}
+
+    def tell(k: int, left: float) -> None:
+        progress.say(f'round {k}: misties {left:.3f} m rms')
+
     if options.adjusted:
         fixed = [unit.number for unit in units if unit.line in options.fixed]
         try:
-            found = adjust_lines(
-                statistics,
-                units,
-                budget,
-                fixed,
-                cell,
-                work / 'adjustment.npz',
-                lambda k, left: progress.say(f'round {k}: misties {left:.3f} m rms'),
-            )
+            place = work / 'adjustment.npz'
+            found = adjust_lines(statistics, units, budget, fixed, cell, place, tell)
         except ValueError as error:
             raise BagError(f'the lines cannot be adjusted: {error}') from None
         warnings += _warnings_of(found)
         looks = statistics(found.corrections)
-        after, _, _ = find_misties(
-            looks, (*made_of, found.corrections), work / 'adjusted_misties.json'
-        )
+        place, made_of = work / 'adjusted_misties.json', (*made_of, found.corrections)
+        after, _, _ = find_misties(looks, made_of, place)
         rms = found.rms[0]
     tiles = plan_tiles(looks, options.resolution)
     extent_of(tiles)
     corrections = none if found is None else found.corrections
-    files = _tiled(units, tiles, corrections, found, budget, rms, work, run, progress)
+    files = _tiled(units, tiles, corrections, found, budget, rms, jobs)
     for sentence in warnings:
         progress.warn(sentence)
     return Survey(
@@ -349,19 +363,19 @@ def make(
 
 
 def _imported(
-    sources: Sequence[Source], work: Path, options: Options, run: Run, progress: Progress
+    sources: Sequence[Source], options: Options, jobs: _Jobs
 ) -> tuple[list[Unit], list[dict[str, Any]], ErrorBudget]:
-    places = [
-        work / 'lines' / hashlib.sha256(os.fsencode(source.name)).hexdigest()[:16]
-        for source in sources
-    ]
+    work, progress = jobs.work, jobs.progress
+    digests = [hashlib.sha256(os.fsencode(source.name)).hexdigest() for source in sources]
+    places = [work / 'lines' / digest[:16] for digest in digests]
     for folder in ('lines', 'looks', 'adjusted', 'soundings', 'tiles'):
         (work / folder).mkdir(parents=True, exist_ok=True)
     infos: list[dict[str, Any]] = [{} for _ in sources]
     failures = [source.failure for source in sources]
     todo = [k for k, failure in enumerate(failures) if not failure]
     advance = progress.begin('lines', len(todo))
-    for n, info, failure in run(import_line, [(sources[k], places[k], options) for k in todo]):
+    calls = [(sources[k], places[k], options) for k in todo]
+    for n, info, failure in jobs.run(import_line, calls):
         infos[todo[n]], failures[todo[n]] = info or {}, failure
         advance(1)
     units: list[Unit] = []
@@ -369,14 +383,9 @@ def _imported(
     for source, place, info, failure in zip(sources, places, infos, failures):
         if failure:
             progress.warn(f'left out: {source.name}: {failure}')
-        lines.append(
-            {
-                'name': source.name,
-                'folder': str(source.folder),
-                **{key: info.get(key) for key in _STATED},
-                'failure': failure,
-            }
-        )
+        stated = {key: info.get(key) for key in _STATED}
+        named = {'name': source.name, 'folder': str(source.folder)}
+        lines.append({**named, **stated, 'failure': failure})
         made_with = (kept(place.with_suffix('.json')) or {}).get('wanted')
         for piece in range(info.get('pieces', 0)):
             several = f'#{piece + 1}' if info['pieces'] > 1 else ''
@@ -396,9 +405,7 @@ def _imported(
         raise BagError(f'no line can be read; the first: {failures[0]}')
     if unknown := set(options.fixed) - {unit.line for unit in units}:
         raise BagError(f'there is no line {sorted(unknown)[0]} to fix')
-    widest = {
-        name: max(getattr(budget, name) for budget in budgets) for name in asdict(budgets[0])
-    }
+    widest = {name: max(getattr(each, name) for each in budgets) for name in asdict(budgets[0])}
     return units, lines, ErrorBudget(**widest)
 
 
@@ -409,14 +416,13 @@ def _tiled(
     found: Adjustment | None,
     budget: ErrorBudget,
     rms: float,
-    work: Path,
-    run: Run,
-    progress: Progress,
+    jobs: _Jobs,
 ) -> dict[Tile, Path]:
     """The files of the tiles that hold soundings."""
+    work = jobs.work
     places = [work / 'soundings' / f'{unit.file.stem}.npy' for unit in units]
     calls = [(unit, corrections[unit.number], tiles, place) for unit, place in zip(units, places)]
-    rows = _all(run, tile_line, calls, progress, 'sorting', units)
+    rows = jobs.all(tile_line, calls, 'sorting', units)
     holders: dict[str, list[int]] = {}
     for k, ranges in enumerate(rows):
         for name in ranges:
@@ -425,46 +431,35 @@ def _tiled(
     tiles = [tile for tile in tiles if tile.name in holders]
     # What is not known of the mean speed of a line is among the corrections then.
     own = budget if found is None else evolve(budget, sound_speed=0.0)
-    jobs = []
+    left = rms if found is None else 0.0
+    made = []
     for tile in tiles:
         names = near[tile.name]
         numbers = sorted({k for name in names for k in holders.get(name, ())})
-        parts = [
-            (k, places[k], [rows[k][name] for name in names if name in rows[k]]) for k in numbers
-        ]
+        ranges = [[rows[k][name] for name in names if name in rows[k]] for k in numbers]
         covariance = None if found is None else found.of_lines(numbers)
-        jobs.append(
+        lines = [units[k].signature for k in numbers]
+        used = lines, ranges, corrections[numbers], asdict(own), covariance, left
+        made.append(
             TileJob(
                 tile=tile,
-                parts=parts,
-                signature=signed(
-                    __version__,
-                    tile.name,
-                    [units[k].signature for k in numbers],
-                    [part[2] for part in parts],
-                    corrections[numbers],
-                    asdict(own),
-                    covariance,
-                    0.0 if found is not None else rms,
-                ),
+                parts=[(k, places[k], each) for k, each in zip(numbers, ranges)],
+                signature=signed(__version__, tile.name, *used),
                 budget=own,
                 covariance=covariance,
-                crossing_rms=0.0 if found is not None else rms,
+                crossing_rms=left,
                 place=work / 'tiles' / f'{tile.name}.npz',
             )
         )
-    _all(run, make_tile, [(job,) for job in jobs], progress, 'tiles', tiles)
-    return {job.tile: job.place for job in jobs}
+    jobs.all(make_tile, [(job,) for job in made], 'tiles', tiles)
+    return {job.tile: job.place for job in made}
 
 
 def _neighbours(tiles: Sequence[Tile]) -> dict[str, list[str]]:
     """Of each tile the names of those that its nodes need, itself among them, in order."""
-    low = (
-        np.array([[tile.i, tile.j] for tile in tiles])
-        * TILE
-        * np.array([[tile.cell] for tile in tiles])
-    )
-    side = np.array([tile.cell * TILE for tile in tiles])[:, None]
+    cell = np.array([[tile.cell] for tile in tiles])
+    low = np.array([[tile.i, tile.j] for tile in tiles]) * TILE * cell
+    side = cell * TILE
     names = [tile.name for tile in tiles]
     found = {}
     for k, tile in enumerate(tiles):
@@ -475,7 +470,6 @@ def _neighbours(tiles: Sequence[Tile]) -> dict[str, list[str]]:
 
 
 def _unstated(sources: Sequence[Source], lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return warnings that name the lines whose error budget is assumed, all of it or a part."""
     lacking: dict[str, list[str]] = {}
     for source, line in zip(sources, lines):
         if not line['failure'] and (missing := unstated(source.run)):
@@ -486,19 +480,6 @@ def _unstated(sources: Sequence[Source], lines: Sequence[Mapping[str, Any]]) -> 
         named = ', '.join(names[:3]) + (', ...' if len(names) > 3 else '')
         kind = 'error budget' if what == RUN else 'values'
         found.append(f'{counted(len(names), "line")} without {what} ({named}): default {kind}')
-    return found
-
-
-def _far(lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return warnings that name the lines of which soundings are left out."""
-    found = []
-    for line in lines:
-        if far := line['far']:
-            says = 'lies far away and is' if far == 1 else 'lie far away and are'
-            found.append(
-                f'{line["name"]}: {counted(far, "sounding")} {says} left out: no ship that sees '
-                'the others can have seen them'
-            )
     return found
 
 
@@ -518,26 +499,3 @@ def _warnings_of(found: Adjustment) -> list[str]:
             'the array only: where the speed at the array is wrong too, beam angles are as well'
         )
     return warnings
-
-
-def _all(
-    run: Run,
-    work: Callable[..., Any],
-    calls: Sequence[tuple[Any, ...]],
-    progress: Progress,
-    what: str,
-    named: Sequence[Any],
-) -> list[Any]:
-    """What came of all calls, in their order. Raises `BagError` naming the first that failed."""
-    results: list[Any] = [None] * len(calls)
-    failures: dict[int, str] = {}
-    advance = progress.begin(what, len(calls))
-    for k, result, failure in run(work, calls):
-        results[k] = result
-        if failure:
-            failures[k] = failure
-        advance(1)
-    if failures:
-        k = min(failures)
-        raise BagError(f'{what}: {named[k].name}: {failures[k]}; --resume makes what is missing')
-    return results

@@ -6,8 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The files of a survey: charts, provenance, coverage, the adjustment, where lines cross, and a
-page that shows them."""
+"""The files of a survey: charts, provenance, coverage, adjustment, crossings, and their page."""
 
 from __future__ import annotations
 
@@ -22,7 +21,6 @@ from typing import Any
 
 from attrs import asdict, fields
 import numpy as np
-import plotly.graph_objects as go
 import plotly.offline
 
 from sonar_imm import __version__
@@ -31,7 +29,7 @@ from sonar_imm.files import hindrance, mark, MARKER, remove_leftovers, replaced,
 from sonar_imm.parameters import ConfigError
 from sonar_imm.texts import visible
 
-from ..evaluation.plotting import add_points, COLOURS, styled
+from ..evaluation.plotting import COLOURS, Picture
 from ..evaluation.report import rendered
 from ..offline.run_folder import REPORT
 from ..recordings.csv_writer import CsvWriter
@@ -137,8 +135,7 @@ def _is_survey(out: Path) -> bool:
 
 
 def write(survey: Survey, out: Path) -> dict[str, Any]:
-    """Write all files; gives the content of survey.json, which is the last of them. Raises
-    `BagError`."""
+    """Write all files; gives the content of survey.json, the last of them. Raises `BagError`."""
     counts = {tile: len(nodes.z) for tile, nodes in survey.nodes()}
     west, north, cell, rows, columns = extent_of(list(counts))
     bands = {name: np.full((rows, columns), np.nan, np.float32) for name in OF_A_SURVEY}
@@ -275,9 +272,6 @@ def _write_crossings(path: Path, survey: Survey) -> None:
             writer.write([names[pair[0]], names[pair[1]], cells, *row])
 
 
-# -- the page of a survey: chart, uncertainty, what competes, misties, what could not be told -----
-
-
 MOST_CELLS = 400
 """Cells along the longer side of a figure."""
 SUN = (math.radians(315.0), math.radians(45.0))
@@ -321,18 +315,17 @@ def write_report(out: Path, survey: Survey, chart: Chart, content: Mapping[str, 
         unfinished.write_bytes(f'{text}\n'.encode('utf-8', 'backslashreplace'))
 
 
-def hillshaded(chart: Chart, thin: int) -> go.Figure:
+def hillshaded(chart: Chart, thin: int) -> Picture:
     """Depths, darker where they turn from the light."""
     depth = chart.bands['depth'][::thin, ::thin]
     figure = _image(chart, chart.bands['depth'], thin, 'depth [m]', 'Viridis_r')
     # Rows go south.
-    down, east = (
-        np.gradient(-depth, thin * chart.cell) if min(depth.shape) > 1 else (0 * depth,) * 2
-    )
+    down = east = 0 * depth
+    if min(depth.shape) > 1:
+        down, east = np.gradient(-depth, thin * chart.cell)
     azimuth, elevation = SUN
-    light = math.sin(elevation) - math.cos(elevation) * (
-        math.sin(azimuth) * east - math.cos(azimuth) * down
-    )
+    across = math.sin(azimuth) * east - math.cos(azimuth) * down
+    light = math.sin(elevation) - math.cos(elevation) * across
     shade = np.clip(light / np.sqrt(1.0 + np.square(east) + np.square(down)), 0.0, 1.0)
     x, y = chart.axes(thin)
     figure.add_heatmap(
@@ -346,9 +339,9 @@ def hillshaded(chart: Chart, thin: int) -> go.Figure:
     return figure
 
 
-def misties_figure(survey: Survey) -> go.Figure:
+def misties_figure(survey: Survey) -> Picture:
     """Robust rms of each pair of lines, before and after."""
-    figure = go.Figure()
+    figure = Picture()
     pairs = sorted({*survey.before, *survey.after})
     for name, found, colour in (
         ('before', survey.before, COLOURS[1]),
@@ -357,13 +350,12 @@ def misties_figure(survey: Survey) -> go.Figure:
         there = [k for k, pair in enumerate(pairs) if pair in found]
         values = [found[pairs[k]].rms for k in there]
         if there:
-            add_points(figure, there, values, name, colour, 6)
-    return styled(
-        figure, 320, {'title': 'pair of lines'}, {'title': 'rms [m]', 'rangemode': 'tozero'}
-    )
+            figure.points(there, values, name, colour, 6)
+    rms = {'title': 'rms [m]', 'rangemode': 'tozero'}
+    return figure.styled(320, {'title': 'pair of lines'}, rms)
 
 
-def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str) -> go.Figure:
+def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str) -> Picture:
     x, y = chart.axes(thin)
     shown = values[::thin, ::thin].astype(np.float32)
     low, high = (-1.0, 1.0)
@@ -372,14 +364,12 @@ def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str
     if colours == 'RdBu':
         high = max(abs(low), abs(high))
         low = -high
-    figure = go.Figure()
-    figure.add_heatmap(
-        x=x, y=y, z=shown, colorscale=colours, zmin=low, zmax=high, colorbar={'title': title}
-    )
+    figure, bar = Picture(), {'title': title}
+    figure.add_heatmap(x=x, y=y, z=shown, colorscale=colours, zmin=low, zmax=high, colorbar=bar)
     axis = {'zeroline': False, 'tickformat': 'd'}
     east = {'title': 'east [m]', 'constrain': 'domain', 'nticks': 5, **axis}
     north = {'title': 'north [m]', 'scaleanchor': 'x', **axis}
-    return styled(figure, 560, east, north)
+    return figure.styled(560, east, north)
 
 
 def _summary(survey: Survey, chart: Chart) -> str:

@@ -81,11 +81,9 @@ def adjust_lines(
         save_arrays(place, {**columns, 'signature': np.array(signature)})
 
     solved = Rounds(**known) if known else None
-    found = adjust(
-        statistics, len(units), budget, fixed=fixed, note=note, solved=solved, keep=keep
-    )
-    keep(found)
-    return found
+    made = adjust(statistics, len(units), budget, fixed=fixed, note=note, solved=solved, keep=keep)
+    keep(made)
+    return made
 
 
 def _load(place: Path, signature: str) -> Mapping[str, Any]:

@@ -16,18 +16,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from sonar_imm.acoustics import arrivals_3d as arrivals
 from sonar_imm.acoustics import multistatic
 from sonar_imm.acoustics.arrival_fit import ArrivalFit, minimise
-from sonar_imm.acoustics.arrivals_3d import (
-    arrival_angles,
-    arrival_paths,
-    BEARING,
-    ELEVATION,
-    HEIGHT,
-    observe,
-    ONE_WAY,
-    PATH,
-)
 from sonar_imm.estimation.angles import wrap_angle
 
 Z = -6.0
@@ -58,23 +49,14 @@ KINDS = {'active': [True] * 5, 'passive': [False] * 5, 'mixed': [True, False, Tr
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_residuals_vanish_at_the_truth_whatever_the_emission(kind):
+def test_residuals_vanish_at_the_truth_and_have_the_gradient_of_their_differences(kind):
+    """Whatever the emission, also with rows left out."""
     fit = problem(KINDS[kind], offset=-750.0)
-    residual, _ = fit.residuals(TRUTH[None], fit.weight)
-    assert_allclose(residual, 0.0, atol=1e-10)
-
-
-@pytest.mark.parametrize('kind', KINDS)
-def test_jacobian_equals_finite_differences_also_with_rows_left_out(kind):
-    fit = problem(KINDS[kind], offset=40.0)
+    assert_allclose(fit.residuals(TRUTH[None], fit.weight)[0], 0.0, atol=1e-10)
     weight = fit.weight * [1, 1, 0, 1, 1, 0, 1]
-    at, h = np.array([[10.0, -15.0]]), 1e-5
-    _, jacobian = fit.residuals(at, weight)
-    numeric = [
-        (fit.residuals(at - h * e, weight)[0] - fit.residuals(at + h * e, weight)[0]) / (2 * h)
-        for e in np.eye(2)
-    ]
-    assert_allclose(jacobian[0], np.stack(numeric, axis=-1)[0], atol=1e-6)
+    due = slope(lambda p: -fit.residuals(p[None], weight)[0][0], np.array([10.0, -15.0]))
+    _, jacobian = fit.residuals(np.array([[10.0, -15.0]]), weight)
+    assert_allclose(jacobian[0], due, atol=1e-6)
 
 
 @pytest.mark.parametrize('kind', KINDS)
@@ -88,13 +70,6 @@ def test_cost_is_the_sum_of_squares_with_the_best_emission(kind):
         for offset in (-1e-3, 1e-3):
             worse = np.square(residual + offset * shift) @ fit.weight
             assert (worse > fit.cost(places, fit.weight)).all()
-
-
-def test_closed_form_meets_the_truth():
-    fit = problem(KINDS['passive'], offset=123.0, bearings=0)
-    for rows in ([0, 1, 2], [0, 1, 2, 3, 4]):
-        meeting = fit._closed_form(np.array(rows))
-        assert np.linalg.norm(meeting - TRUTH, axis=-1).min() < 1e-6
 
 
 @pytest.mark.parametrize('kind', KINDS)
@@ -111,7 +86,7 @@ def test_search_finds_the_lowest_point_of_a_fine_grid(kind):
 
 
 # With the first seeds the grid alone misses the lowest minimum, with the others the closed form.
-@pytest.mark.parametrize('seed', [333, 399, 435, 468, 570, 9, 24, 81, 117, 183, 228, 294, 297])
+@pytest.mark.parametrize('seed', [333, 399, 435, 9, 24, 81])
 def test_tag_search_is_never_worse_than_one_begun_at_the_truth(seed):
     rng = np.random.default_rng(seed)
     n, sigma = 4 + seed % 2, 0.15 * (1 if seed % 3 else 60)
@@ -128,22 +103,12 @@ def test_tag_search_is_never_worse_than_one_begun_at_the_truth(seed):
     assert found.cost[0] <= 1.001 * begun.cost[0] + 1e-3
 
 
-def test_a_search_begins_evenly_all_round():
-    """The points of an ellipse have its centre as their mean, those of a circle theirs."""
-    fit = problem(KINDS['active'])
-    rows = np.argsort(-fit.weight[:5], kind='stable')[:3]
-    middle = 0.5 * (fit.tx + fit.rx)[rows, :2]
-    assert_allclose(fit._ellipses(np.arange(5)).mean(axis=1)[:3], middle, atol=1e-9)
-    fit = problem(KINDS['passive'])
-    circles = fit._polar_grid().mean(axis=1)
-    assert_allclose(circles, np.tile(fit.centre, (len(circles), 1)), atol=1e-9)
-
-
 def test_runs_that_leave_for_infinity_end():
     fit = problem(KINDS['passive'], offset=40.0, bearings=0)
     minima = minimise(fit, np.array([TRUTH, [5e3, 8e3]]), fit.weight)
     assert minima.converged.all()
     assert_allclose(minima.position[0], TRUTH, atol=1e-6)
+    assert len(minimise(fit, np.empty((0, 2)), fit.weight).distinct().cost) == 0
 
 
 def test_each_start_may_have_its_own_weights():
@@ -157,13 +122,6 @@ def test_each_start_may_have_its_own_weights():
     assert minima.cost[[0, 1, 3, 4]].min() > 1.0
 
 
-def test_without_starts_there_are_no_minima():
-    fit = problem(KINDS['active'])
-    assert len(minimise(fit, np.empty((0, 2)), fit.weight).distinct().cost) == 0
-
-
-# -- measurement models against finite differences, symmetry and the joint estimate ---------------
-
 COORDINATE = st.floats(-300.0, 300.0)
 POINT = st.tuples(COORDINATE, COORDINATE, st.floats(-40.0, 0.0)).map(np.array)
 PLACE = st.tuples(COORDINATE, COORDINATE).map(np.array)
@@ -176,83 +134,37 @@ def slope(function, position, step=1e-4):
     return np.stack([(ahead - behind) / (2 * step) for ahead, behind in ends], axis=-1)
 
 
-def turned(points, angle, shift):
-    """Points (..., 2 or 3) turned about z and moved in x, y."""
-    c, s = np.cos(angle), np.sin(angle)
-    out = np.array(points, float)
-    out[..., :2] = out[..., :2] @ np.array([[c, s], [-s, c]]) + shift
-    return out
-
-
-def distance(position, points, z):
-    return multistatic.slant_range(position, points, z)[0]
-
-
-def direction(position, points, z):
-    return multistatic.slant_range(position, points, z)[1]
-
-
-def scene(n, seed):
-    rng = np.random.default_rng(seed)
-    rx = np.column_stack([rng.uniform(-100, 100, (n, 2)), rng.uniform(-10, 0, n)])
-    tx = np.column_stack([rng.uniform(-100, 100, (n, 2)), rng.uniform(-10, 0, n)])
-    return tx, rx, rng.uniform(-80, 80, 2), rng.uniform(0.5, 2.0, n) * 1e-7
-
-
 @quick
 @given(PLACE, POINT, POINT, st.floats(-40.0, 0.0))
-def test_jacobians_equal_finite_differences(position, tx, rx, z):
-    away = [np.hypot(*(position - point[:2])) for point in (tx, rx)]
-    assume(min(away) > 0.5)
+def test_ranges_and_bearings_are_those_of_the_definition_with_their_slopes(position, tx, rx, z):
+    assume(min(np.hypot(*(position - point[:2])) for point in (tx, rx)) > 0.5)
+    legs = [np.linalg.norm(np.append(position, z) - point) for point in (tx, rx)]
     tx, rx = tx[None], rx[None]
+    assert_allclose(multistatic.range_sum(position, tx, rx, z), sum(legs), rtol=1e-12)
     found = multistatic.range_sum_jacobian(position, tx, rx, z)
     due = slope(lambda p: multistatic.range_sum(p, tx, rx, z), position)
     assert_allclose(found, due, atol=1e-6)
-    due = slope(lambda p: distance(p, rx, z), position)
-    assert_allclose(direction(position, rx, z), due, atol=1e-6)
+    length, direction = multistatic.slant_range(position, rx, z)
+    assert_allclose(length, legs[1], rtol=1e-12)
+    due = slope(lambda p: multistatic.slant_range(p, rx, z)[0], position)
+    assert_allclose(direction, due, atol=1e-6)
     around = multistatic.bearing(position, rx)
+    east, north = position - rx[0, :2]
+    assert_allclose(around, np.arctan2(north, east), atol=1e-12)
     due = slope(lambda p: wrap_angle(multistatic.bearing(p, rx) - around), position)
     assert_allclose(multistatic.bearing_jacobian(position, rx), due, rtol=1e-6, atol=1e-7)
 
 
-@quick
-@given(PLACE, POINT, POINT, st.floats(-4.0, 4.0), PLACE)
-def test_models_turn_and_move_with_the_scene(position, tx, rx, angle, shift):
-    assume(np.hypot(*(position - rx[:2])) > 0.1)
-    given = position, tx[None], rx[None]
-    moved = [turned(each, angle, shift) for each in given]
-    found, due = (multistatic.range_sum(*each, -5.0) for each in (moved, given))
-    assert_allclose(found, due, rtol=1e-9)
-    gain = multistatic.bearing(moved[0], moved[2]) - multistatic.bearing(position, rx[None])
-    assert_allclose(wrap_angle(gain - angle), 0.0, atol=1e-9)
-    found, due = (multistatic.range_sum_jacobian(*each, -5.0) for each in (moved, given))
-    assert_allclose(found, turned(due, angle, 0.0), atol=1e-6)
-
-
 def test_hand_worked_values():
-    tx, rx = np.array([[0.0, 0.0, 0.0]]), np.array([[3.0, 4.0, 0.0]])
-    position = np.array([3.0, 0.0])
+    tx, rx, position = np.zeros((1, 3)), np.array([[3.0, 4.0, 0.0]]), np.array([3.0, 0.0])
     assert_allclose(multistatic.range_sum(position, tx, rx, 0.0), [7.0])
     assert_allclose(multistatic.range_sum_jacobian(position, tx, rx, 0.0), [[1.0, -1.0]])
     assert_allclose(multistatic.bearing(position, rx), [-np.pi / 2])
     assert_allclose(multistatic.bearing_jacobian(position, rx), [[0.25, 0.0]])
     assert_allclose(multistatic.range_sum(position, tx, rx, 4.0), [5.0 + np.sqrt(32.0)])
-
-
-def test_leading_axes():
-    tx, rx, _, _ = scene(5, seed=1)
-    position = np.random.default_rng(2).uniform(-50, 50, (4, 3, 2))
-    for value, shape in (
-        (multistatic.range_sum(position, tx, rx, -3.0), (4, 3, 5)),
-        (multistatic.range_sum_jacobian(position, tx, rx, -3.0), (4, 3, 5, 2)),
-        (multistatic.bearing(position, rx), (4, 3, 5)),
-        (multistatic.bearing_jacobian(position, rx), (4, 3, 5, 2)),
-        (distance(position, rx, -3.0), (4, 3, 5)),
-    ):
-        assert value.shape == shape
-        assert np.isfinite(value).all()
-    found = multistatic.range_sum(position, tx, rx, -3.0)[2, 1]
-    assert_allclose(found, multistatic.range_sum(position[2, 1], tx, rx, -3.0))
+    many = np.tile(position, (4, 3, 1))
+    assert_allclose(multistatic.range_sum(many, tx, rx, 0.0), np.full((4, 3, 1), 7.0))
+    assert multistatic.bearing_jacobian(many, rx).shape == (4, 3, 1, 2)
 
 
 @pytest.mark.parametrize('distance', [0.0, 1e-300, 1e-160, 1e-9])
@@ -269,27 +181,18 @@ def test_coincident_points_give_no_information_and_no_nan(distance):
     assert_allclose(multistatic.range_sum_jacobian(point[0, :2], point, point, -5.0), 0.0)
 
 
-def test_gradient_vanishes_on_the_baseline():
-    tx, rx = np.array([[-50.0, 0.0, -5.0]]), np.array([[80.0, 0.0, -5.0]])
-    assert_allclose(multistatic.range_sum_jacobian([12.0, 0.0], tx, rx, -5.0), 0.0, atol=1e-15)
-
-
-# -- time differences ----------------------------------------------------------------------------
-
 SOUND_SPEED = 1480.0
 
 
 def test_emission_time_and_its_variance_are_those_of_the_joint_estimate():
-    n = 6
-    _, rx, truth, variance = scene(n, seed=21)
-    toa = distance(truth, rx, -4.0) / SOUND_SPEED + 77.25
+    variance = np.linspace(0.5, 2.0, len(RX)) * 1e-7
+    length, direction = multistatic.slant_range(TRUTH, RX, -4.0)
     known = {'target_z': -4.0, 'sound_speed': SOUND_SPEED}
-    time, _ = multistatic.emission_time(toa, variance, rx, truth, **known)
-    assert time == pytest.approx(77.25, abs=1e-12)
-    augmented = np.column_stack([direction(truth, rx, -4.0) / SOUND_SPEED, np.ones(n)])
+    seen = length / SOUND_SPEED + 77.25, variance, RX, TRUTH
+    assert multistatic.emission_time(*seen, **known)[0] == pytest.approx(77.25, abs=1e-12)
+    augmented = np.column_stack([direction / SOUND_SPEED, np.ones(len(RX))])
     joint = np.linalg.inv(augmented.T @ np.diag(1.0 / variance) @ augmented)
-    known['covariance'] = joint[:2, :2]
-    _, stated = multistatic.emission_time(toa, variance, rx, truth, **known)
+    _, stated = multistatic.emission_time(*seen, **known, covariance=joint[:2, :2])
     assert stated == pytest.approx(joint[2, 2], rel=1e-9)
 
 
@@ -298,26 +201,26 @@ def test_emission_time_and_its_variance_are_those_of_the_joint_estimate():
 
 def test_the_paths_of_the_vectors():
     v = vectors('arrivals_3d')
-    got, jacobian = arrival_paths(v['position'], v['tx'], v['rx']), v['out_jacobian']
-    np.testing.assert_allclose(got.length, v['out_path'], atol=1e-9)
-    np.testing.assert_allclose(got.by_position, jacobian[:, :3], atol=1e-9)
+    got, jacobian = arrivals.arrival_paths(v['position'], v['tx'], v['rx']), v['out_jacobian']
+    assert_allclose(got.length, v['out_path'], atol=1e-9)
+    assert_allclose(got.by_position, jacobian[:, :3], atol=1e-9)
     for r in range(4):
-        np.testing.assert_allclose(got.by_offset[r], jacobian[r, 3 + 2 * r : 5 + 2 * r], atol=1e-9)
+        assert_allclose(got.by_offset[r], jacobian[r, 3 + 2 * r : 5 + 2 * r], atol=1e-9)
         assert jacobian[r, 13 + r] == got.by_clock[r]
-    np.testing.assert_allclose(got.by_sound_speed, jacobian[:, 17], atol=1e-9)
+    assert_allclose(got.by_sound_speed, jacobian[:, 17], atol=1e-9)
 
 
 def test_the_angles_of_the_vectors():
     v = vectors('usbl')
     known = v['position'], v['receiver'][None]
-    bearing, by_bearing, elevation, by_elevation = arrival_angles(*known)
+    bearing, by_bearing, elevation, by_elevation = arrivals.arrival_angles(*known)
     assert bearing[0] == pytest.approx(float(v['out_bearing']), abs=1e-9)
     assert elevation[0] == pytest.approx(float(v['out_elevation']), abs=1e-9)
-    np.testing.assert_allclose(by_bearing[0], v['out_jacobian_bearing'], atol=1e-9)
-    np.testing.assert_allclose(by_elevation[0], v['out_jacobian_elevation'], atol=1e-9)
-    leg = arrival_paths(v['position'], None, v['receiver'][None])
+    assert_allclose(by_bearing[0], v['out_jacobian_bearing'], atol=1e-9)
+    assert_allclose(by_elevation[0], v['out_jacobian_elevation'], atol=1e-9)
+    leg = arrivals.arrival_paths(v['position'], None, v['receiver'][None])
     assert leg.length[0] == pytest.approx(float(v['out_range']), abs=1e-9)
-    np.testing.assert_allclose(leg.by_position[0], v['out_jacobian_range'], atol=1e-9)
+    assert_allclose(leg.by_position[0], v['out_jacobian_range'], atol=1e-9)
 
 
 COLUMNS = np.array([0, 1, 3, 5, 7, 8, 9])
@@ -327,40 +230,40 @@ STATE = np.array([31.0, -12.0, 0.7, -9.0, 0.1, 0.6, -0.4, 0.8, 0.003, 4.0])
 def seen(kind, states, tx, rx, columns=COLUMNS, height=0.0):
     """What one measurement of a kind expects at states (L, n): values (L,), gradients (L, n)."""
     one = np.array([kind]), columns[None], tx[None], rx[None]
-    value, gradient = observe(np.atleast_2d(states).T, height, *one)
+    value, gradient = arrivals.observe(np.atleast_2d(states).T, height, *one)
     return value[0], gradient[0].T
 
 
-@pytest.mark.parametrize('kind', [PATH, ONE_WAY, BEARING, ELEVATION, HEIGHT])
+DIRECTED = arrivals.PATH, arrivals.ONE_WAY, arrivals.BEARING, arrivals.ELEVATION
+
+
+@pytest.mark.parametrize('kind', [*DIRECTED, arrivals.HEIGHT])
 def test_the_form_for_many_states_equals_the_plain_one_and_its_gradient_the_differences(kind):
     tx, rx = np.array([0.0, 0.0, -3.0]), np.array([70.0, 10.0, -5.0])
     (value,), (gradient,) = seen(kind, STATE, tx, rx)
     place = STATE[[0, 1, 3]]
-    angles = arrival_angles(place, rx[None])
+    angles = arrivals.arrival_angles(place, rx[None])
     errors = {'offset': STATE[5:7], 'clock': STATE[7], 'sound_speed_error': STATE[8]}
-    expected = {
-        PATH: arrival_paths(place, tx, rx[None], **errors).length[0],
-        ONE_WAY: arrival_paths(place, None, rx[None], **errors).length[0] + STATE[9],
-        BEARING: angles[0][0] + STATE[7],  # an error of all bearings has the place of a clock
-        ELEVATION: angles[2][0],
-        HEIGHT: STATE[3],
-    }[kind]
+    both, one = (arrivals.arrival_paths(place, t, rx[None], **errors) for t in (tx, None))
+    # An error of all bearings has the place of a clock.
+    due = both.length[0], one.length[0] + STATE[9], angles[0][0] + STATE[7], angles[2][0], STATE[3]
+    expected = dict(zip((*DIRECTED, arrivals.HEIGHT), due))[kind]
     assert value == pytest.approx(expected, abs=1e-12)
     step = 1e-6 * np.eye(10)
     ahead, behind = seen(kind, STATE + step, tx, rx)[0], seen(kind, STATE - step, tx, rx)[0]
     # angles have no gradient by the offset of the receiver: it is metres among tens
-    np.testing.assert_allclose(gradient, (ahead - behind) / 2e-6, atol=1e-7)
+    assert_allclose(gradient, (ahead - behind) / 2e-6, atol=1e-7)
 
 
 def test_measurements_of_all_kinds_at_once_are_those_of_each_kind():
     """Each with errors of its own receiver, or none."""
-    kind = np.array([HEIGHT, PATH, BEARING, ONE_WAY, PATH, ELEVATION])
+    kind = np.array([arrivals.HEIGHT, *DIRECTED, arrivals.PATH])
     rng = np.random.default_rng(5)
     tx, rx = rng.uniform(-80.0, 80.0, (2, 6, 3))
     columns = np.tile(COLUMNS, (6, 1))
-    columns[4, 3:5] = columns[2, 4] = -1
+    columns[5, 3:5] = columns[3, 4] = -1
     states = STATE + rng.normal(size=(4, 10))
-    value, gradient = observe(states.T, 0.0, kind, columns, tx, rx)
+    value, gradient = arrivals.observe(states.T, 0.0, kind, columns, tx, rx)
     for c in range(6):
         each = seen(kind[c], states, tx[c], rx[c], columns[c])
         np.testing.assert_array_equal(value[c], each[0])
@@ -368,10 +271,10 @@ def test_measurements_of_all_kinds_at_once_are_those_of_each_kind():
 
 
 def test_without_states_the_height_is_the_given_one_and_no_point_is_singular():
-    columns = np.array([0, 1, -1, -1, -1, -1, -1])
-    here = np.array([5.0, 5.0, -3.0])
-    for kind in (PATH, ONE_WAY, BEARING, ELEVATION):
+    columns, here = np.array([0, 1, -1, -1, -1, -1, -1]), np.array([5.0, 5.0, -3.0])
+    for kind in DIRECTED:
         value, gradient = seen(kind, here[:2], here, here, columns, -3.0)
         assert np.isfinite(value).all() and (gradient == 0.0).all()
-    assert all(np.isfinite(part).all() for part in arrival_paths(here, here, here[None]))
-    assert all(np.isfinite(part).all() for part in arrival_angles(here, here[None]))
+    found = arrivals.arrival_paths(here, here, here[None])
+    angles = arrivals.arrival_angles(here, here[None])
+    assert all(np.isfinite(part).all() for part in (*found, *angles))

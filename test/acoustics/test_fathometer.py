@@ -17,28 +17,8 @@ from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics import fathometer
-from sonar_imm.acoustics.ambient import (
-    horizontal_noise_csdm,
-    noise_integral,
-    sample_csdm,
-    surface_noise_csdm,
-)
-from sonar_imm.acoustics.fathometer import (
-    chirp_z,
-    coherence,
-    coherence_and_power,
-    conventional,
-    depth_response,
-    echo_phase,
-    echo_spectrum,
-    mvdr,
-    noise_sigma,
-    sampled_share,
-    steering,
-    surface_share,
-    white_noise_loading,
-)
+from sonar_imm.acoustics import ambient
+from sonar_imm.acoustics import fathometer as fm
 from sonar_imm.acoustics.hydrophones import apply_response, correct_phones, fit_phones
 from sonar_imm.acoustics.pulse import band_pulse
 
@@ -52,79 +32,72 @@ def golden():
     return json.loads((VECTORS / 'golden.json').read_text())
 
 
-def complex_of(pair):
-    return complex(*pair)
-
-
 @pytest.fixture(scope='module')
 def band():
     """A coarse band over two layers, and what it is at every frequency."""
     frequency = np.arange(200.0, 4000.0, 4.0)
-    R = surface_noise_csdm(frequency, M, D, [40.0, 52.0], [0.35, 0.1], C)
-    R += 0.01 * np.eye(M) + 0.5 * horizontal_noise_csdm(frequency, M, D, 0.03, C)
+    R = ambient.surface_noise_csdm(frequency, M, D, [40.0, 52.0], [0.35, 0.1], C)
+    R += 0.01 * np.eye(M) + 0.5 * ambient.horizontal_noise_csdm(frequency, M, D, 0.03, C)
     return frequency, R * (frequency[:, None, None] / 1000.0) ** -1.6
 
 
 def test_noise_integrals(golden):
     for x, value in golden['I(x)=2*int_0^1 u e^{ixu}du'].items():
-        assert noise_integral(float(x)) == pytest.approx(complex_of(value), abs=1e-14)
+        assert ambient.noise_integral(float(x)) == pytest.approx(complex(*value), abs=1e-14)
     u = (np.arange(100_000) + 0.5) / 100_000
     for x in (0.0, 5e-4, 2e-3, -7.0):
         expected = np.mean(2.0 * u * np.exp(1j * x * u))
-        assert noise_integral(x) == pytest.approx(expected, abs=1e-9)
+        assert ambient.noise_integral(x) == pytest.approx(expected, abs=1e-9)
     for x in (1e-7, -3e-4, 9.9e-4):
         series = sum(2.0 * (1j * x) ** n / (math.factorial(n) * (n + 2)) for n in range(8))
-        assert noise_integral(x) == pytest.approx(series, abs=1e-13)
+        assert ambient.noise_integral(x) == pytest.approx(series, abs=1e-13)
 
 
 def single_layer():
-    R = surface_noise_csdm([1000.0], M, D, [56.5], [0.35], C) + 0.01 * np.eye(M)
-    return R, steering([1000.0], HEIGHTS, C)
+    R = ambient.surface_noise_csdm([1000.0], M, D, [56.5], [0.35], C) + 0.01 * np.eye(M)
+    return R, fm.steering([1000.0], HEIGHTS, C)
 
 
 def test_cross_spectra_of_one_layer(golden):
     R, _ = single_layer()
     wanted = golden['R(1000Hz) one layer H=56.5 a=.35 no broadside, sens .01']
     assert R[0, 0, 0] == pytest.approx(wanted['R00'])
-    assert R[0, 1, 0] == pytest.approx(complex_of(wanted['R10']))
-    assert R[0, 31, 0] == pytest.approx(complex_of(wanted['R31_0']))
-    assert np.allclose(R, R.conj().swapaxes(1, 2))
-    assert np.linalg.eigvalsh(R[0])[0] > 0.0
+    for row, name in ((1, 'R10'), (31, 'R31_0')):
+        assert R[0, row, 0] == pytest.approx(complex(*wanted[name]))
+    assert np.allclose(R, R.conj().swapaxes(1, 2)) and np.linalg.eigvalsh(R[0])[0] > 0.0
 
 
 @pytest.mark.parametrize('loading', [0.001, 0.01, 1.0])
 def test_mvdr_is_the_golden_one(golden, loading):
     wanted = golden[f'MVDR eps={loading}']
     R, w = single_layer()
-    C_, power = mvdr(R, w, loading)
-    assert C_[0] == pytest.approx(complex_of(wanted['closed']), rel=1e-10)
+    C_, power = fm.mvdr(R, w, loading)
+    assert C_[0] == pytest.approx(complex(*wanted['closed']), rel=1e-10)
     assert abs(C_[0] / power[0]) == pytest.approx(wanted['coherence closed'], rel=1e-10)
     # The weights, each made of the loaded matrix, around the loaded matrix: the same.
     L = R[0] + loading * np.trace(R[0]).real / M * np.eye(M)
     up, down = (np.linalg.solve(L, v) for v in (w[0], w[0].conj()))
     up, down = up / (w[0].conj() @ up), down / (w[0] @ down)
     assert down.conj() @ L @ up == pytest.approx(C_[0], rel=1e-10)
-    unloaded = down.conj() @ R[0] @ up
-    assert unloaded == pytest.approx(complex_of(wanted['explicit_unloaded_R']), rel=1e-9)
 
 
 def test_conventional_is_the_golden_one(golden):
     R, w = single_layer()
-    wanted = complex_of(golden['conv w^T R w/M^2'])
-    assert conventional(R, w)[0][0] / M**2 == pytest.approx(wanted, rel=1e-10)
+    wanted = complex(*golden['conv w^T R w/M^2'])
+    assert fm.conventional(R, w)[0][0] / M**2 == pytest.approx(wanted, rel=1e-10)
 
 
 def response(gamma, frequency, low=20.0, high=80.0, step=1 / 32):
     depth = np.arange(low, high, step)
     spacing = frequency[1] - frequency[0]
-    b = depth_response(gamma, frequency[0], spacing, (low, step, len(depth)), 0.0, C)
+    b = fm.depth_response(gamma, frequency[0], spacing, (low, step, len(depth)), 0.0, C)
     return depth, b
 
 
-@pytest.mark.parametrize('processor', fathometer.PROCESSORS)
+@pytest.mark.parametrize('processor', fm.PROCESSORS)
 def test_the_pulse_peaks_upright_at_the_layer(band, processor):
     frequency, R = band
-    depth, b = response(coherence(R, steering(frequency, HEIGHTS, C), processor), frequency)
+    depth, b = response(fm.coherence(R, fm.steering(frequency, HEIGHTS, C), processor), frequency)
     assert depth[np.argmax(b)] == pytest.approx(40.0, abs=0.04)
     assert b.max() > 2.5 * -b.min()
     near = np.abs(depth - 40.0) < 1.0
@@ -135,28 +108,26 @@ def test_the_pulse_peaks_upright_at_the_layer(band, processor):
 def test_the_echo_keeps_its_sign_as_the_loading_grows(band):
     """Upright to a loading of 3, where an unloaded matrix in the middle turned it over."""
     frequency, R = band
-    w = steering(frequency, HEIGHTS, C)
+    w = fm.steering(frequency, HEIGHTS, C)
     for loading in (1e-3, 1e-2, 0.1, 1.0, 3.0):
-        depth, b = response(coherence(R, w, 'mvdr', loading=loading), frequency)
+        depth, b = response(fm.coherence(R, w, 'mvdr', loading=loading), frequency)
         assert b[np.argmin(np.abs(depth - 40.0))] > 0.005
 
 
 def test_noise_is_as_large_as_predicted():
     frequency = 400.0 + 2.0 * np.arange(1000)
     R = np.tile(np.eye(M), (len(frequency), 1, 1)).astype(complex)
-    rng = np.random.default_rng(0)
-    w = steering(frequency, HEIGHTS, C)
-    seen = [
-        noise_sigma(response(coherence(sample_csdm(R, 64, rng), w, 'conventional'), frequency)[1])
-        for _ in range(4)
-    ]
+    rng, w, seen = np.random.default_rng(0), fm.steering(frequency, HEIGHTS, C), []
+    for _ in range(4):
+        gamma = fm.coherence(ambient.sample_csdm(R, 64, rng), w, 'conventional')
+        seen.append(fm.noise_sigma(response(gamma, frequency)[1]))
     # The variance of an average of 64 snapshots and 1000 frequencies, half of it in the real part.
     assert np.mean(seen) == pytest.approx(1.0 / np.sqrt(2.0 * 64.0 * 1000.0), rel=0.06)
 
 
 def test_frequencies_may_be_missing(band):
     frequency, R = band
-    gamma = coherence(R, steering(frequency, HEIGHTS, C), 'mvdr')
+    gamma = fm.coherence(R, fm.steering(frequency, HEIGHTS, C), 'mvdr')
     gamma[100:110] = np.nan
     depth, b = response(gamma, frequency)
     assert depth[np.argmax(b)] == pytest.approx(40.0, abs=0.04)
@@ -165,29 +136,24 @@ def test_frequencies_may_be_missing(band):
 
 
 def test_depth_response_is_the_sum_it_says(band):
-    frequency, _ = band
-    rng = np.random.default_rng(2)
+    frequency, rng = band[0], np.random.default_rng(2)
     gamma = rng.standard_normal(len(frequency)) + 1j * rng.standard_normal(len(frequency))
     z = 30.0 + 0.013 * np.arange(50)
     direct = np.exp(2j * np.pi * np.outer(2.0 * (z - 7.0) / C, frequency)) @ gamma
     direct /= len(frequency)
     arguments = gamma, frequency[0], 4.0, (30.0, 0.013, 50), 7.0, C
-    assert np.allclose(depth_response(*arguments), direct.real, atol=1e-10)
-    assert np.allclose(depth_response(*arguments, envelope=True), np.abs(direct), atol=1e-10)
-
-
-@pytest.mark.parametrize('N, count', [(1, 1), (1, 9), (13, 4), (64, 200)])
-def test_chirp_z(N, count):
-    rng = np.random.default_rng(N)
-    values = rng.standard_normal(N) + 1j * rng.standard_normal(N)
-    table = np.exp(2j * np.pi * 0.0137 * np.outer(np.arange(count), np.arange(N)))
-    assert np.allclose(chirp_z(values, 0.0137, count), table @ values, atol=1e-10)
+    assert np.allclose(fm.depth_response(*arguments), direct.real, atol=1e-10)
+    assert np.allclose(fm.depth_response(*arguments, envelope=True), np.abs(direct), atol=1e-10)
+    for N, count in ((1, 9), (13, 4)):
+        values = gamma[:N]
+        table = np.exp(2j * np.pi * 0.0137 * np.outer(np.arange(count), np.arange(N)))
+        assert np.allclose(fm.chirp_z(values, 0.0137, count), table @ values, atol=1e-10)
 
 
 def test_white_noise_gain_is_kept(band):
     frequency, R = band
-    w = steering(frequency, HEIGHTS, C)
-    loading = white_noise_loading(R, w, -3.0)
+    w = fm.steering(frequency, HEIGHTS, C)
+    loading = fm.white_noise_loading(R, w, -3.0)
     power = np.einsum('fmm->f', R).real / M
     L = R + (loading * power)[:, None, None] * np.eye(M)
     gains = []
@@ -203,89 +169,84 @@ def test_white_noise_gain_is_kept(band):
 
 
 def test_singular_matrices_are_said_so():
-    w = steering([1000.0], HEIGHTS, C)
+    w = fm.steering([1000.0], HEIGHTS, C)
     with pytest.raises(np.linalg.LinAlgError):
-        mvdr(np.zeros((1, M, M), complex), w, 1e-2)
+        fm.mvdr(np.zeros((1, M, M), complex), w, 1e-2)
     with pytest.raises(ValueError, match='processor'):
-        coherence(np.eye(M)[None] + 0j, w, 'capon')
+        fm.coherence(np.eye(M)[None] + 0j, w, 'capon')
 
 
 def test_the_spectrum_of_an_echo_is_smooth_finite_and_of_mean_one(band):
     frequency, R = band
-    w = steering(frequency, HEIGHTS, C)
-    _, power = coherence_and_power(R, w, 'mvdr')
-    W = echo_spectrum(R, frequency, power)
+    w = fm.steering(frequency, HEIGHTS, C)
+    gamma, power = fm.coherence_and_power(R, w, 'mvdr')
+    assert gamma * power == pytest.approx(1j * fm.mvdr(R, w, 1e-2)[0])
+    W = fm.echo_spectrum(R, frequency, power)
     assert W.mean() == pytest.approx(1.0) and (W > 0.0).all()
     # MVDR is sharper than a plain sum where waves are long.
     assert W[:50].mean() > 2.0 * W[-200:].mean()
-    few = echo_spectrum(R[:3], frequency[:3], power[:3])
+    few = fm.echo_spectrum(R[:3], frequency[:3], power[:3])
     assert few.shape == (3,) and np.isfinite(few).all()
     # A row at 0 Hz counts as its neighbour.
-    direct = echo_spectrum(R[:40], np.append(0.0, frequency[1:40]), power[:40])
-    assert direct == pytest.approx(echo_spectrum(R[:40], frequency[:40], power[:40]), rel=0.1)
-
-
-def test_power_and_coherence_make_the_correlation(band):
-    frequency, R = band
-    w = steering(frequency, HEIGHTS, C)
-    gamma, power = coherence_and_power(R, w, 'mvdr')
-    assert gamma * power == pytest.approx(1j * mvdr(R, w, 1e-2)[0])
+    direct = fm.echo_spectrum(R[:40], np.append(0.0, frequency[1:40]), power[:40])
+    assert direct == pytest.approx(fm.echo_spectrum(R[:40], frequency[:40], power[:40]), rel=0.1)
 
 
 def test_the_share_of_the_surface_is_that_of_the_powers():
     """Noise from the horizontal and of the hydrophones themselves makes no echo."""
     frequency = np.arange(50.0, 4000.0, 10.0)
     heights = 0.18 * np.arange(16)
-    surface = surface_noise_csdm(frequency, 16, 0.18, np.empty(0), np.empty(0), 1500.0)
-    assert surface_share(surface, frequency, heights, 1500.0) == pytest.approx(1.0)
+    surface = ambient.surface_noise_csdm(frequency, 16, 0.18, np.empty(0), np.empty(0), 1500.0)
+    assert fm.surface_share(surface, frequency, heights, 1500.0) == pytest.approx(1.0)
     ships = 3.0 / (1.0 + (frequency / 200.0) ** 2)
-    others = ships[:, None, None] * horizontal_noise_csdm(frequency, 16, 0.18, 0.03, 1500.0)
+    others = ships[:, None, None] * ambient.horizontal_noise_csdm(
+        frequency, 16, 0.18, 0.03, 1500.0
+    )
     R = (surface + others + 0.1 * np.eye(16)) * (frequency[:, None, None] / 1000.0) ** -1.6
-    share = surface_share(R, frequency, heights, 1500.0)
+    share = fm.surface_share(R, frequency, heights, 1500.0)
     assert share[20:-20] == pytest.approx(1.0 / (1.1 + ships[20:-20]), rel=0.1)
     # Some hydrophones are dead.
     alive = np.array([0, 1, 2, 4, 7, 8, 9, 12, 13, 15])
-    some = surface_share(R[:, alive[:, None], alive], frequency, heights[alive], 1500.0)
+    some = fm.surface_share(R[:, alive[:, None], alive], frequency, heights[alive], 1500.0)
     assert some == pytest.approx(share, rel=0.05)
 
 
 def test_the_phase_of_an_echo_is_that_of_the_array_and_its_distance():
     """Against what the response changes by with the amplitude of a layer, 22 m and 40 m below."""
     frequency, heights = np.arange(100.0, 2800.0, 4.0), 0.25 * np.arange(16)
-    w = steering(frequency, heights, C)
+    w = fm.steering(frequency, heights, C)
     for H in (22.0, 40.0):
         with_layer, without = (
-            surface_noise_csdm(frequency, 16, 0.25, [H], [a], C) + 0.01 * np.eye(16)
+            ambient.surface_noise_csdm(frequency, 16, 0.25, [H], [a], C) + 0.01 * np.eye(16)
             for a in (0.1, -0.1)
         )
-        changed = coherence(with_layer, w, 'mvdr') - coherence(without, w, 'mvdr')
+        changed = fm.coherence(with_layer, w, 'mvdr') - fm.coherence(without, w, 'mvdr')
         exact = np.angle(changed * np.exp(4j * np.pi * frequency * H / C))
-        phase = echo_phase(with_layer, frequency, heights, [H], C, 1e-2)[0]
+        phase = fm.echo_phase(with_layer, frequency, heights, [H], C, 1e-2)[0]
         assert phase == pytest.approx(exact, abs=0.02)
         assert exact[:50].mean() < -0.15 * 22.0 / H * 0.8
         # Some hydrophones are dead, and the record has an end.
         alive = np.array([0, 1, 2, 4, 5, 7, 8, 9, 10, 12, 13, 15])
-        R = sample_csdm(with_layer, 100, np.random.default_rng(0))[:, alive[:, None], alive]
-        some = echo_phase(R, frequency, heights[alive], [H], C, 1e-2)[0]
+        R = ambient.sample_csdm(with_layer, 100, np.random.default_rng(0))[
+            :, alive[:, None], alive
+        ]
+        some = fm.echo_phase(R, frequency, heights[alive], [H], C, 1e-2)[0]
         assert some == pytest.approx(exact, abs=0.05)
 
 
 def test_the_power_of_few_snapshots_is_less_by_what_is_fitted():
     frequency, heights = np.full(32, 800.0), 0.18 * np.arange(16)
-    R = surface_noise_csdm(frequency, 16, 0.18, np.empty(0), np.empty(0), 1500.0)
-    R = R + 0.01 * np.eye(16)
-    w = steering(frequency, heights, 1500.0)
-    rng, drawn = np.random.default_rng(0), []
-    for _ in range(20):
-        sampled = sample_csdm(R, 40, rng)
-        drawn.append(coherence_and_power(sampled, w, 'mvdr')[1])
-    exact = coherence_and_power(R, w, 'mvdr')[1]
-    expected = sampled_share(sampled.astype(np.complex128), 1e-2, 40.0)
+    R = ambient.surface_noise_csdm(frequency, 16, 0.18, np.empty(0), np.empty(0), 1500.0)
+    R, w = R + 0.01 * np.eye(16), fm.steering(frequency, heights, 1500.0)
+    rng = np.random.default_rng(0)
+    sampled = [ambient.sample_csdm(R, 40, rng) for _ in range(20)]
+    drawn = np.mean([fm.coherence_and_power(each, w, 'mvdr')[1] for each in sampled])
+    exact, last = (fm.coherence_and_power(R, w, 'mvdr')[1], sampled[-1].astype(np.complex128))
+    expected = fm.sampled_share(last, 1e-2, 40.0)
     assert expected.max() < 0.9
-    louder = sampled_share(1e6 * sampled.astype(np.complex128), 1e-2, 40.0)
-    assert louder == pytest.approx(expected)
+    assert fm.sampled_share(1e6 * last, 1e-2, 40.0) == pytest.approx(expected)
     # That of every beam together: a beam where it is quiet is fitted less.
-    assert np.mean(drawn) / exact[0] == pytest.approx(expected.mean(), rel=0.08)
+    assert drawn / exact[0] == pytest.approx(expected.mean(), rel=0.08)
 
 
 # -- hydrophones that differ: against vectors, and each fault in a record of its own -------------
@@ -300,14 +261,9 @@ def fitted(csdm, phones=PLACES, **options):
 
 
 @pytest.fixture(scope='module')
-def vectors():
-    return load_vectors('fathometer_in_the_field/phones')
-
-
-@pytest.fixture(scope='module')
 def clean():
-    R = surface_noise_csdm(FREQUENCY, PHONES, SPACING, [22.0, 36.0], [0.35, 0.2], SPEED)
-    return sample_csdm(R + 0.01 * np.eye(PHONES), 100, np.random.default_rng(0))
+    R = ambient.surface_noise_csdm(FREQUENCY, PHONES, SPACING, [22.0, 36.0], [0.35, 0.2], SPEED)
+    return ambient.sample_csdm(R + 0.01 * np.eye(PHONES), 100, np.random.default_rng(0))
 
 
 def heard(csdm, response):
@@ -322,49 +278,29 @@ def late(seconds, phone=9):
     return response
 
 
-def test_response_of_the_vectors(vectors):
-    wave = float(vectors['sound_speed'] / vectors['element_spacing'])
-    fit = fit_phones(vectors['csdm'], vectors['frequency'], PLACES, wave)
-    assert np.abs(fit.gain / vectors['gain'] - 1.0).max() < 1e-6
-    assert (fit.sign == vectors['sign']).all() and (fit.sign == vectors['true_sign']).all()
-    assert np.abs(fit.delay - vectors['delay']).max() < 1e-6
-    assert np.abs(fit.share - vectors['share']).max() < 0.02
-    corrected = apply_response(vectors['csdm'], vectors['frequency'], fit)
-    power = np.einsum('fmm->fm', vectors['csdm']).real.mean()
-    assert np.abs(corrected - vectors['corrected']).max() < 1e-3 * power
+def test_response_of_the_vectors():
+    v = load_vectors('fathometer_in_the_field/phones')
+    wave = float(v['sound_speed'] / v['element_spacing'])
+    fit = fit_phones(v['csdm'], v['frequency'], PLACES, wave)
+    assert np.abs(fit.gain / v['gain'] - 1.0).max() < 1e-6
+    assert (fit.sign == v['sign']).all() and (fit.sign == v['true_sign']).all()
+    assert np.abs(fit.delay - v['delay']).max() < 1e-6
+    assert np.abs(fit.share - v['share']).max() < 0.02
+    corrected = apply_response(v['csdm'], v['frequency'], fit)
+    power = np.einsum('fmm->fm', v['csdm']).real.mean()
+    assert np.abs(corrected - v['corrected']).max() < 1e-3 * power
 
 
-def test_equal_hydrophones_are_left_as_they_are(clean):
+def test_equal_hydrophones_are_left_as_they_are_and_gains_are_levelled(clean):
     corrected, keep, fit = fitted(clean)
     assert keep.all() and (fit.sign == 1).all()
     assert np.abs(fit.delay).max() < 2e-6
     assert np.abs(10.0 * np.log10(np.median(fit.gain, axis=0))).max() < 0.2
     assert np.abs(corrected - clean).max() < 0.2 * np.abs(clean).max()
-
-
-@pytest.mark.parametrize('factor', [0.1, 0.5, 2.0])
-def test_gains_of_hydrophones(clean, factor):
-    response = np.where(PLACES == 5, factor, 1.0)
-    corrected, keep, fit = fitted(heard(clean, response))
-    assert keep.all()
-    assert np.median(fit.gain[:, 5]) == pytest.approx(factor**2, rel=0.05)
-    other, _, _ = fitted(clean)
-    assert np.abs(corrected - other).max() < 0.05 * np.abs(other).max()
-
-
-@pytest.mark.parametrize('turned', [[4], [0, 15], [3, 4, 5], [1, 3, 5, 7, 9]])
-def test_signs_of_hydrophones(clean, turned):
-    response = np.where(np.isin(PLACES, turned), -1.0, 1.0)
-    _, keep, fit = fitted(heard(clean, response))
-    assert keep.all() and (fit.sign == response).all()
-    assert np.abs(fit.delay).max() < 2e-6
-
-
-@pytest.mark.parametrize('seconds', [50e-6, -120e-6])
-def test_a_delay_of_a_hydrophone(clean, seconds):
-    _, _, fit = fitted(heard(clean, late(seconds)))
-    assert fit.delay[9] == pytest.approx(seconds, rel=0.12)
-    assert np.abs(np.delete(fit.delay, 9)).max() < 0.12 * abs(seconds)
+    for factor in (0.1, 2.0):
+        other, keep, fit = fitted(heard(clean, np.where(PLACES == 5, factor, 1.0)))
+        assert keep.all() and np.median(fit.gain[:, 5]) == pytest.approx(factor**2, rel=0.05)
+        assert np.abs(corrected - other).max() < 0.05 * np.abs(other).max()
 
 
 def test_delays_of_all_are_found_but_for_a_tilt_which_stays(clean):
@@ -381,37 +317,27 @@ def test_delays_of_all_are_found_but_for_a_tilt_which_stays(clean):
 def alone(phones, snapshots, seed):
     """Cross-spectra (F, phones, phones) of hydrophones that have nothing in common."""
     unit = np.repeat(np.eye(phones)[None], len(FREQUENCY), axis=0)
-    return sample_csdm(unit, snapshots, np.random.default_rng(seed))
+    return ambient.sample_csdm(unit, snapshots, np.random.default_rng(seed))
 
 
-@pytest.mark.parametrize('place', [0, 7, 15])
+@pytest.mark.parametrize('place', [0, 7])
 def test_a_hydrophone_that_hears_something_else_is_left_out(clean, place):
     own, foreign = alone(PHONES, 100, 4), clean.copy()
     foreign[:, place], foreign[:, :, place] = own[:, place], own[:, :, place]
     corrected, keep, fit = fitted(foreign)
-    assert (
-        keep.sum() == PHONES - 1
-        and not keep[place]
-        and corrected.shape[1:] == (PHONES - 1, PHONES - 1)
-    )
+    assert keep.sum() == PHONES - 1 and not keep[place] and corrected.shape[1] == PHONES - 1
     assert abs(fit.share[place]) < 0.05 and np.delete(fit.share, place).min() > 0.95
     assert np.abs(np.delete(fit.delay, place)).max() < 2e-6
 
 
-@pytest.mark.parametrize('kind', ['8 alone', '16 alone', '3 together', '4 together', 'gains'])
-def test_where_nothing_else_can_be_told_hydrophones_are_levelled_only(clean, kind):
+def test_where_nothing_else_can_be_told_hydrophones_are_levelled_only(clean):
     """Of those that hear nothing in common, of few, and where no more is asked for."""
-    few = heard(clean, late(100e-6, 1))
-    csdm = {
-        '8 alone': alone(8, 5, 5),
-        '16 alone': alone(16, 100, 5),
-        '3 together': few[:, :3, :3],
-        '4 together': few[:, :4, :4],
-        'gains': heard(clean, late(100e-6)),
-    }[kind]
-    _, keep, fit = fitted(csdm, np.arange(csdm.shape[1]), full=kind != 'gains')
-    assert keep.all() and (fit.sign == 1).all() and not fit.delay.any()
-    assert np.isnan(fit.share).all()
+    few, one = heard(clean, late(100e-6, 1)), heard(clean, late(100e-6))
+    rows = (alone(8, 5, 5), True), (alone(16, 100, 5), True), (few[:, :4, :4], True), (one, False)
+    for csdm, full in rows:
+        _, keep, fit = fitted(csdm, np.arange(csdm.shape[1]), full=full)
+        assert keep.all() and (fit.sign == 1).all() and not fit.delay.any()
+        assert np.isnan(fit.share).all()
 
 
 def test_dead_hydrophones_leave_gaps(clean):

@@ -22,11 +22,11 @@ from sonar_imm.acoustics import array, coherence, interference, laplace, wave_ke
 STEP = array.phase_step(0.5)
 
 
-def complex_normal(rng, *shape):
-    return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / math.sqrt(2.0)
+def circular(rng, *shape):
+    return rng.normal(size=shape) + 1j * rng.normal(size=shape)
 
 
-@pytest.mark.parametrize('staves', [2, 3, 4, 8, 16, 64])
+@pytest.mark.parametrize('staves', [2, 3, 8, 64])
 @pytest.mark.parametrize('q', [0.3, 5.0, 200.0])
 def test_the_law_is_the_mixture_it_is_derived_from(staves, q):
     # The same by integrating over the power z, without any Bessel function.
@@ -42,9 +42,8 @@ def test_the_law_is_the_mixture_it_is_derived_from(staves, q):
     )
 
 
-@pytest.mark.parametrize('q', [0.1, 0.3])
-def test_where_the_bessel_function_overflows_the_law_is_its_integral_still(q):
-    log_u = np.linspace(-3.0, 8.0, 100_001)
+def test_where_the_bessel_function_overflows_the_law_is_its_integral_still():
+    log_u, q = np.linspace(-3.0, 8.0, 100_001), 0.3
     height = 199.0 * log_u - np.exp(log_u) - q * np.exp(-log_u)
     integral = np.exp(height - height.max()).sum() * (log_u[1] - log_u[0])
     expected = math.log(0.5 * integral) + height.max() - 199.0 * math.log(q)
@@ -52,7 +51,7 @@ def test_where_the_bessel_function_overflows_the_law_is_its_integral_still(q):
     assert laplace.log_density(q, 200) == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize('staves', range(2, 17))
+@pytest.mark.parametrize('staves', [2, 3, 8, 16])
 def test_both_laws_integrate_to_one(staves):
     # Over C^P in whitened coordinates: shells of area pi^P / Gamma(P) q^(P-1) dq, q = v^2.
     shell = staves * math.log(math.pi) - math.lgamma(staves) + math.log(2.0)
@@ -68,58 +67,29 @@ def test_both_laws_integrate_to_one(staves):
 
     assert total(laplace.log_density, constant) == pytest.approx(1.0, abs=1e-8)
     assert total(lambda q, _: -q, gaussian) == pytest.approx(1.0, abs=1e-8)
-
-
-@pytest.mark.parametrize('constant', [laplace.log_constant, laplace.gaussian_log_constant])
-def test_in_another_unit_both_laws_are_densities_too(constant):
     # Snapshots 3 times as large: |Gamma| is 9^P times, the volume around each too.
-    change = constant(8, 5.0 + 8 * math.log(9.0)) - constant(8, 5.0)
-    assert change == pytest.approx(-8 * math.log(9.0))
+    larger = staves * math.log(9.0)
+    for of in (laplace.log_constant, laplace.gaussian_log_constant):
+        assert of(staves, 5.0 + larger) - of(staves, 5.0) == pytest.approx(-larger)
 
 
-def test_extreme_values_stay_finite_and_ordered():
-    q = np.geomspace(1e-300, 1e15, 2000)
-    for staves in (2, 3, 8, 33, 64):
-        f = laplace.log_density(q, staves)
+def test_extreme_values_stay_finite_and_ordered_and_the_slope_is_the_derivative():
+    q, ln_q = np.geomspace(1e-300, 1e15, 2000), np.linspace(-8.0, 15.0, 200)
+    for staves in (2, 3, 8, 64):
+        f, slope = laplace.log_density(q, staves), laplace.log_density_slope(q, staves)
         assert np.isfinite(f).all() and (np.diff(f) < 0.0).all()
-        slope = laplace.log_density_slope(q, staves)
         assert np.isfinite(slope).all() and (slope <= 0.0).all()
-    assert laplace.log_density(0.0, 8) == np.inf
-
-
-def test_the_slope_is_the_derivative():
-    ln_q = np.linspace(-8.0, 15.0, 200)
-    for staves in (2, 5, 16, 64):
         ends = [laplace.log_density(np.exp(ln_q + d), staves) for d in (1e-5, -1e-5)]
         slope = laplace.log_density_slope(np.exp(ln_q), staves)
         assert np.allclose((ends[0] - ends[1]) / 2e-5, slope, rtol=1e-5)
+    assert laplace.log_density(0.0, 8) == np.inf
 
 
-@pytest.mark.parametrize('staves', [2, 3, 8, 17])
-def test_the_form_is_that_of_the_covariance(staves):
-    rng = np.random.default_rng(staves)
-    y = complex_normal(rng, 4, staves)
-    signal, noise = rng.uniform(0.1, 100.0, 4), rng.uniform(0.1, 10.0, 4)
-    g = laplace.form_coefficients(y, signal, noise)
-    for u in (-0.8, 0.0, 0.37):
-        q = (g * np.exp(-1j * STEP * u * np.arange(staves))).sum(axis=1).real
-        for n in range(4):
-            a = array.steering(u, staves, 0.5)
-            gamma = signal[n] * np.outer(a, a.conj()) + noise[n] * np.eye(staves)
-            assert q[n] == pytest.approx((y[n].conj() @ np.linalg.solve(gamma, y[n])).real)
-            determinant = staves * np.log(noise[n]) + np.log1p(staves * signal[n] / noise[n])
-            assert determinant == pytest.approx(np.linalg.slogdet(gamma)[1])
-
-
-@pytest.mark.parametrize('likelihood', laplace.LIKELIHOODS)
-@pytest.mark.parametrize('staves', [2, 3, 4, 8, 16, 64])
-def test_the_table_is_the_likelihood(staves, likelihood):
+@pytest.mark.parametrize('staves', [2, 8, 64])
+def test_the_table_is_the_likelihood(staves):
     q = np.geomspace(2.0**-20, 2.0**49.99, 20_000)
-    out = log_densities(q, laplace.likelihood_table(staves, likelihood))
-    if likelihood == 'gaussian':
-        assert np.allclose(out, -q, rtol=1e-12)
-        return
-    root = np.sqrt(q)
+    assert np.allclose(log_densities(q, laplace.likelihood_table(staves, 'gaussian')), -q, 1e-12)
+    out, root = log_densities(q, laplace.likelihood_table(staves)), np.sqrt(q)
     exact = np.log(kve(staves - 1, 2 * root)) - 2 * root + (1 - staves) * np.log(root)
     error = np.abs(out - exact) / np.maximum(1.0, np.abs(exact))
     finite = np.isfinite(exact)  # the Bessel function overflows in the first cells of many staves
@@ -137,11 +107,11 @@ def test_what_the_table_does_not_reach_is_held_at_its_end():
 
 
 @pytest.mark.parametrize('likelihood', laplace.LIKELIHOODS)
-@pytest.mark.parametrize('staves, spacing', [(2, 0.5), (5, 0.3), (8, 0.5), (8, -0.5), (64, 0.5)])
+@pytest.mark.parametrize('staves, spacing', [(2, 0.5), (5, 0.3), (8, -0.5)])
 def test_the_likelihood_by_its_parts_is_that_of_the_definition(staves, spacing, likelihood):
     rng = np.random.default_rng(2)
     u = np.append(rng.uniform(-1.0, 1.0, 300), [np.nan, 1.0, -1.0])
-    y, signal, noise = 3.0 * complex_normal(rng, staves), 40.0, 0.7
+    y, signal, noise = 3.0 * circular(rng, staves), 40.0, 0.7
     out = log_likelihoods(
         u, spacing, laplace.form_coefficients(y, signal, noise), 0.0, np.empty(0, complex), 0.0,
         laplace.likelihood_table(staves, likelihood),
@@ -155,7 +125,7 @@ def test_the_likelihood_by_its_parts_is_that_of_the_definition(staves, spacing, 
 TILT = math.radians(30.0)
 
 
-@pytest.mark.parametrize('tilt', [-0.4, 0.0, 0.3, TILT, 1.2])
+@pytest.mark.parametrize('tilt', [-0.4, TILT, 1.2])
 def test_the_direction_sine_is_the_sine_of_the_angle(tilt):
     rng = np.random.default_rng(0)
     r = rng.uniform(5.0, 80.0, 1000)
@@ -180,11 +150,8 @@ def test_the_phase_is_that_of_the_path_to_each_stave():
 
 def test_a_floor_beyond_the_range_is_impossible():
     D = np.array([15.0 + 1e-9, -15.1, 15.0, np.nan, np.inf])
-    for values in (
-        array.direction_sine(D, 15.0, TILT),
-        array.angle_of_depth(D, 15.0, TILT),
-        array.across_track(D, 15.0),
-    ):
+    sine, angle = (of(D, 15.0, TILT) for of in (array.direction_sine, array.angle_of_depth))
+    for values in (sine, angle, array.across_track(D, 15.0)):
         assert np.isnan(values).tolist() == [True, True, False, True, True]
     assert np.isnan(array.direction_sine(1.0, 0.0, TILT))
 
@@ -225,8 +192,7 @@ NOISE = np.array([1.0, 0.5, 2.0])
 
 @pytest.fixture
 def scene():
-    rng = np.random.default_rng(0)
-    y = rng.normal(size=(3, STAVES)) + 1j * rng.normal(size=(3, STAVES))
+    y = circular(np.random.default_rng(0), 3, STAVES)
     return y, interference.noise_covariance(SINES, VARIANCES, NOISE, STAVES, STEP)
 
 
@@ -257,12 +223,8 @@ def test_the_likelihood_by_its_parts_is_that_of_linear_algebra(scene, likelihood
         assert np.allclose(out[:-1], expected[:-1], rtol=3e-7, atol=1e-6)
 
 
-def noise(rng, *shape):
-    return rng.normal(size=shape) + 1j * rng.normal(size=shape)
-
-
 def test_it_is_the_maximum_over_all_directions():
-    iq = noise(np.random.default_rng(0), 400, 8)
+    iq = circular(np.random.default_rng(0), 400, 8)
     gamma, sine = coherence.coherence(iq, 0.5)
     grid = np.linspace(-1.0, 1.0, 4001)
     beams = np.abs(iq @ array.steering(grid, 8, 0.5).conj().T) ** 2
@@ -283,50 +245,41 @@ def test_a_plane_wave_is_fully_coherent_whatever_its_level():
 
 
 def test_silent_and_broken_bins_have_none():
-    iq = noise(np.random.default_rng(1), 4, 8)
+    iq = circular(np.random.default_rng(1), 4, 8)
     iq[0], iq[1, 3], iq[2, 0] = 0.0, np.nan, np.inf
     gamma, sine = coherence.coherence(iq, 0.5)
     assert np.isnan(gamma).tolist() == np.isnan(sine).tolist() == [True, True, True, False]
     assert coherence.silent_bins(gamma, 8)[:3].all()
 
 
-@pytest.mark.parametrize('staves, spacing', [(2, 0.5), (3, 0.5), (8, 0.5), (8, 0.3), (24, 0.5)])
+@pytest.mark.parametrize('staves, spacing', [(2, 0.5), (8, 0.3), (24, 0.5)])
 def test_noise_passes_as_often_as_the_formula_says(staves, spacing):
-    gamma, _ = coherence.coherence(noise(np.random.default_rng(2), 60_000, staves), spacing)
+    gamma, _ = coherence.coherence(circular(np.random.default_rng(2), 60_000, staves), spacing)
     for probability in (0.05, 0.01):
         level = coherence.coherence_threshold(staves, 1, probability, spacing)
-        assert coherence.false_alarm_probability(level, staves, spacing) == pytest.approx(
-            probability
-        )
+        rate = coherence.false_alarm_probability(level, staves, spacing)
+        assert rate == pytest.approx(probability)
         assert (gamma > level).mean() == pytest.approx(probability, rel=0.15, abs=2e-3)
-
-
-@pytest.mark.parametrize('staves', [2, 4, 8, 32])
-def test_means_of_bins_pass_at_most_as_often(staves):
-    gamma, _ = coherence.coherence(noise(np.random.default_rng(3), 100_000, staves), 0.5)
-    means = gamma.reshape(-1, coherence.GATE_BINS).mean(axis=1)
-    level = coherence.coherence_threshold(staves, coherence.GATE_BINS, 0.01)
-    assert 0.003 < (means > level).mean() < 0.013
-
-
-def test_thresholds_for_eight_staves():
-    assert coherence.coherence_threshold(8) == pytest.approx(0.782, abs=0.002)
-    assert coherence.coherence_threshold(8, coherence.GATE_BINS) == pytest.approx(0.563, abs=0.002)
-
-
-def test_the_law_for_two_staves_is_exact():
-    # gamma = 1/2 + |x0 x1| with |x0|^2 uniform: Pr(gamma > t) = 2 sqrt(t (1 - t)).
+    # With |x0|^2 uniform, gamma of two is 1/2 + |x0 x1|: Pr(gamma > t) = 2 sqrt(t (1 - t)).
     t = np.linspace(0.51, 1.0, 50)
     expected = 2.0 * np.sqrt(t * (1.0 - t))
     assert np.allclose(coherence.false_alarm_probability(t, 2), expected)
+
+
+@pytest.mark.parametrize('staves', [2, 8])
+def test_means_of_bins_pass_at_most_as_often(staves):
+    gamma, _ = coherence.coherence(circular(np.random.default_rng(3), 100_000, staves), 0.5)
+    means = gamma.reshape(-1, coherence.GATE_BINS).mean(axis=1)
+    level = coherence.coherence_threshold(staves, coherence.GATE_BINS, 0.01)
+    assert 0.003 < (means > level).mean() < 0.013
 
 
 def test_a_shadow_is_silent_and_an_echo_is_not():
     rng = np.random.default_rng(4)
     signal = np.where((np.arange(2000) // 200) % 2 == 0, 10.0, 0.0)  # 10 dB, shadows between
     fading = rng.exponential(size=2000)
-    iq = noise(rng, 2000, 8) / np.sqrt(2.0)
-    iq += np.sqrt(signal / 2)[:, None] * noise(rng, 2000, 1) * array.steering(0.3, 8, 0.5)
+    iq = circular(rng, 2000, 8) / np.sqrt(2.0)
+    iq += np.sqrt(signal / 2)[:, None] * circular(rng, 2000, 1) * array.steering(0.3, 8, 0.5)
     silent = coherence.silent_bins(coherence.coherence(np.sqrt(fading)[:, None] * iq, 0.5)[0], 8)
     assert silent[signal == 0.0].mean() > 0.99
     # A coherent echo fades below the noise now and then.
@@ -334,24 +287,23 @@ def test_a_shadow_is_silent_and_an_echo_is_not():
 
 
 def test_for_two_staves_the_mean_decides():
-    iq = noise(np.random.default_rng(5), 3000, 2)
-    silent = coherence.silent_bins(coherence.coherence(iq, 0.5)[0], 2)
-    assert silent.mean() > 0.99
-    iq += 20.0 * noise(np.random.default_rng(6), 3000, 1) * array.steering(0.3, 2, 0.5)
-    silent = coherence.silent_bins(coherence.coherence(iq, 0.5)[0], 2)
-    assert silent.mean() < 0.3
+    iq = circular(np.random.default_rng(5), 3000, 2)
+    wave = 20.0 * circular(np.random.default_rng(6), 3000, 1) * array.steering(0.3, 2, 0.5)
+    silent, heard = (
+        coherence.silent_bins(coherence.coherence(each, 0.5)[0], 2).mean()
+        for each in (iq, iq + wave)
+    )
+    assert silent > 0.99 and heard < 0.3
 
 
 def test_the_compiled_peaks_are_those_of_numpy():
-    iq = noise(np.random.default_rng(7), 300, 8)
+    iq = circular(np.random.default_rng(7), 300, 8)
     gamma, sine = coherence.coherence(iq, 0.5)
-    form = laplace.autocorrelation(iq)
+    form, grid = laplace.autocorrelation(iq), array.direction_grid(8, 0.5)
     form[:, 1:] *= 2.0
-    grid = array.direction_grid(8, 0.5)
-    cosine, sines = np.cos(np.pi * grid), np.sin(np.pi * grid)
-    height, place = np.empty(300), np.empty(300)
+    height, place, *spare = (np.empty(n) for n in (300, 300, len(grid), len(grid)))
     wave_kernels.beam_peaks(
-        form, cosine, sines, np.empty(len(grid)), np.empty(len(grid)), height, place
+        form, np.cos(np.pi * grid), np.sin(np.pi * grid), *spare, height, place
     )
     power = np.square(np.abs(iq)).sum(axis=1)
     assert np.allclose(height / (8.0 * power), gamma, atol=1e-12)
@@ -360,25 +312,20 @@ def test_the_compiled_peaks_are_those_of_numpy():
 
 def test_coherence_beside_an_interferer_is_that_of_what_it_leaves():
     rng = np.random.default_rng(8)
-    iq = noise(rng, 4000, 8) + 30.0 * noise(rng, 4000, 1) * array.steering(-0.6, 8, 0.5)
+    iq = circular(rng, 4000, 8) + 30.0 * circular(rng, 4000, 1) * array.steering(-0.6, 8, 0.5)
     assert not coherence.silent_bins(coherence.coherence(iq, 0.5)[0], 8)[10:].all()
-    step = array.phase_step(0.5)
+    known = np.full((4000, 1), -0.6), 1800.0, np.full(4000, 2.0), 8, array.phase_step(0.5)
+    R = interference.noise_covariance(*known)
 
     def silent(samples):
-        R = interference.noise_covariance(
-            np.full((4000, 1), -0.6), 1800.0, np.full(4000, 2.0), 8, step
-        )
         form = interference.interference_form(samples, R)
         return coherence.silent_bins(interference.coherence_beside(form, 0.5), 8)
 
     assert silent(iq).mean() > 0.98
-    iq += 20.0 * noise(rng, 4000, 1) * array.steering(0.2, 8, 0.5)
+    iq += 20.0 * circular(rng, 4000, 1) * array.steering(0.2, 8, 0.5)
     assert silent(iq).mean() < 0.1
-    assert np.isnan(
-        interference.coherence_beside(
-            interference.interference_form(np.zeros((1, 8)), np.eye(8)[None]), 0.5
-        )
-    ).all()
+    nothing = interference.interference_form(np.zeros((1, 8)), np.eye(8)[None])
+    assert np.isnan(interference.coherence_beside(nothing, 0.5)).all()
 
 
 def test_a_peak_is_refined_where_the_spectrum_bends_down_and_nowhere_else():

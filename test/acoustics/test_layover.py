@@ -14,22 +14,19 @@ import math
 import os
 from pathlib import Path
 
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 
 from benchmarks.layover_tables import levels, pooled, snapshots
 from sonar_imm.acoustics import array, coherence, layover, loudness, spatial, variances
 from sonar_imm.acoustics.variances import mean_power, signal_variance
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'layover'
-
 
 @pytest.fixture(scope='module')
 def pings():
-    with np.load(VECTORS / 'pings.npz') as archive:
-        known = dict(archive)
+    known = load_vectors('layover/pings')
     parts = known['iq'].astype(np.float32)
     known['iq'] = parts[..., 0] + 1j * parts[..., 1]
     return known
@@ -43,8 +40,8 @@ def found(iq, noise=1.0, spacing=0.5):
 
 @pytest.mark.parametrize('staves', [2, 3, 4, 8])
 def test_residuals_are_those_of_the_prototype_or_smaller(staves):
-    with np.load(VECTORS / 'residuals.npz') as known:
-        y, R, L = (known[f'{name}{staves}'] for name in 'yRL')
+    known = load_vectors('layover/residuals')
+    y, R, L = (known[f'{name}{staves}'] for name in 'yRL')
     power, single, two = layover.residuals(y, 0.5)
     assert power == pytest.approx(R[:, 0], rel=1e-6)
     assert single == pytest.approx(R[:, 1], abs=1e-3)
@@ -54,7 +51,7 @@ def test_residuals_are_those_of_the_prototype_or_smaller(staves):
     assert (2.0 * (np.sqrt(single) - np.sqrt(two)) - L)[same] == pytest.approx(0.0, abs=2e-3)
 
 
-@pytest.mark.parametrize('staves, spacing', [(4, 0.5), (8, 0.5), (8, 0.3), (5, 3.66)])
+@pytest.mark.parametrize('staves, spacing', [(4, 0.5), (8, 0.3), (5, 3.66)])
 def test_two_exact_waves_leave_nothing(staves, spacing):
     rng = np.random.default_rng(3)
     a, b = rng.uniform(-0.9, 0.9, (2, 200))
@@ -64,28 +61,6 @@ def test_two_exact_waves_leave_nothing(staves, spacing):
     assert np.quantile(two / power, 0.95) < 1e-4
     # What is left beside one wave is at most all of the second.
     assert (single <= 0.01 * staves * 1.001).all()
-
-
-def test_a_search_over_all_pairs_finds_hardly_more():
-    y = snapshots(80, 8, 25.0, 2, np.random.default_rng(1))
-    power, _, two = layover.residuals(y, 0.5)
-    q = np.arange(8)[:, None]
-
-    def left(phases, row):
-        """What the waves of these phase steps leave of a row, by an orthonormal basis."""
-        basis, _ = np.linalg.qr(np.exp(1j * q * phases))
-        return float(np.square(np.abs(row)).sum() - np.square(np.abs(basis.conj().T @ row)).sum())
-
-    grid = np.linspace(-math.pi, math.pi, 64, endpoint=False)
-    pairs = np.array([(a, b) for a, b in product(grid, grid) if 0.05 < b - a < 6.2])
-    bases = np.linalg.qr(np.exp(1j * q * pairs[:, None]))[0]
-    explained = np.square(np.abs(np.einsum('kpi,np->nki', bases.conj(), y))).sum(axis=2)
-    starts = pairs[np.argsort(explained, axis=1)[:, -4:]]
-    best = [
-        min(minimize(left, pair, row, 'Nelder-Mead').fun for pair in near)
-        for row, near in zip(y, starts)
-    ]
-    assert (two - best > 0.05).mean() < 0.03
 
 
 def test_silent_bins_and_scale():
@@ -100,18 +75,17 @@ def test_silent_bins_and_scale():
 
 
 def test_the_table_is_normalised_so_that_its_mean_under_one_surface_is_one():
-    for staves, fades in product((8, 4, 2), (False, True)):
-        for decibels in (0.0, 5.0, 20.0, 30.0):
-            rng = np.random.default_rng((9, staves, int(decibels)))
-            L = levels(snapshots(6000, staves, decibels, 1, rng, fades))
-            snr = np.full(6000, 10.0 ** (0.1 * decibels))
-            ratio = np.exp(layover.log_ratio(L, snr, staves, float(fades)))
-            # At high ratios rare bins say much: the mean of a sample is uncertain, and so is what
-            # the sample says of its error.
-            assert ratio.mean() == pytest.approx(1.0, abs=0.01 if decibels < 10.0 else 0.7)
+    for staves, fades, decibels in product((8, 2), (False, True), (0.0, 5.0, 30.0)):
+        rng = np.random.default_rng((9, staves, int(decibels)))
+        L = levels(snapshots(6000, staves, decibels, 1, rng, fades))
+        snr = np.full(6000, 10.0 ** (0.1 * decibels))
+        ratio = np.exp(layover.log_ratio(L, snr, staves, float(fades)))
+        # At high ratios rare bins say much: the mean of a sample is uncertain, and so is what the
+        # sample says of its error.
+        assert ratio.mean() == pytest.approx(1.0, abs=0.01 if decibels < 10.0 else 0.7)
 
 
-@pytest.mark.parametrize('staves, least', [(2, 0.7), (4, 0.9), (8, 0.9), (32, 0.9)])
+@pytest.mark.parametrize('staves, least', [(2, 0.7), (32, 0.9)])
 def test_a_ping_says_whether_its_noise_fades_with_the_echo_whatever_its_power(staves, least):
     usable = np.ones(1000, bool)
     for fades in (False, True):
@@ -154,35 +128,22 @@ def test_the_chain_is_forward_backward():
     evidence = np.random.default_rng(5).normal(0.0, 2.0, 12)
     b, e = layover.BIRTH, layover.END
     step = np.array([[1.0 - b, b], [e, 1.0 - e]])
-    joint = {(): 1.0}
-    for value in evidence:
-        likelihood = 1.0, math.exp(value)
-        joint = {
-            (*path, j): weight
-            * (step[path[-1], j] if path else (e, b)[j] / (b + e))
-            * likelihood[j]
-            for path, weight in joint.items()
-            for j in (0, 1)
-        }
-    total = sum(joint.values())
-    expected = [
-        sum(weight for path, weight in joint.items() if path[t]) / total
-        for t in range(len(evidence))
-    ]
+    paths = np.array(list(product((0, 1), repeat=len(evidence))))
+    weight = np.where(paths[:, 0], b, e) / (b + e) * np.exp(paths @ evidence)
+    weight *= step[paths[:, :-1], paths[:, 1:]].prod(axis=1)
+    expected = weight @ paths / weight.sum()
     assert layover.existence(evidence) == pytest.approx(expected, abs=1e-12)
 
 
-def test_existence_of_the_prototype(pings):
-    for iq, chain in zip(pings['iq'], pings['existence_chain']):
-        assert (np.abs(found(iq).existence - chain) < 0.1).mean() >= 0.98
-
-
 def test_objects_are_caught_and_a_flat_floor_is_kept(pings):
+    """And what is said of them is what the prototype says."""
     caught = single = lost = seen = 0
-    for iq, power, h, kind in zip(pings['iq'], pings['power'], pings['h'], pings['kind']):
-        gated = found(iq).existence > layover.GATE
+    names = ('iq', 'power', 'h', 'kind', 'existence_chain')
+    for iq, power, h, kind, chain in zip(*(pings[name] for name in names)):
+        existence = found(iq).existence
+        assert (np.abs(existence - chain) < 0.1).mean() >= 0.98
+        gated, there = existence > layover.GATE, power > 0.0
         order = np.sort(power, axis=1)[:, ::-1]
-        there = power > 0.0
         highest = np.where(there, h, -np.inf).max(axis=1)
         apart = highest - np.where(there, h, np.inf).min(axis=1) > 0.5
         two = (order[:, 1] >= 1.0) & (order[:, 1] > order[:, 0] * 10**-1.5) & apart
@@ -192,8 +153,7 @@ def test_objects_are_caught_and_a_flat_floor_is_kept(pings):
         caught, seen = caught + (gated & two).sum(), seen + two.sum()
         alone = (order[:, 1] == 0.0) & (order[:, 0] > 0.0)
         lost, single = lost + (gated & alone).sum(), single + alone.sum()
-    assert caught / seen > 0.85
-    assert lost / single < 0.005
+    assert caught / seen > 0.85 and lost / single < 0.005
 
 
 @pytest.mark.parametrize('share, least', [(0.0, layover.LEAST_ERROR), (0.005, 0.005)])
@@ -234,11 +194,11 @@ def paper_pings():
     return [(entry.measurement, true) for entry, true in zip(scene.measurements, scene.truth)]
 
 
-def plane_waves(u, staves=8, spacing=0.5, noise=0.01, conjugate=False, seed=0):
-    rng = np.random.default_rng(seed)
+def plane_waves(u, staves=8, spacing=0.5, noise=0.01, conjugate=False):
+    rng = np.random.default_rng(0)
     phase = np.exp(2j * np.pi * rng.uniform(size=(len(u), 1)))
     y = phase * array.steering(u, staves, spacing, conjugate=conjugate)
-    return y + noise * (rng.normal(size=y.shape) + 1j * rng.normal(size=y.shape))
+    return y + math.sqrt(2.0) * noise * circular(rng, *y.shape)
 
 
 @pytest.mark.parametrize('conjugate', [False, True])
@@ -249,25 +209,6 @@ def test_a_lone_wave_is_found(method, conjugate):
         spectrum = spatial.ping_spectrum(iq, GRID, 0.5, method=method, conjugate=conjugate)
         assert spectrum.shape == (30, len(GRID))
         assert np.abs(spatial.peak_sines(spectrum, GRID) - u).max() < 2e-3
-
-
-def test_two_waves_closer_than_a_beam_are_told_apart():
-    rng = np.random.default_rng(1)
-    waves = [array.steering(u, 8, 0.5) for u in (0.1, 0.25)]
-    s = rng.normal(size=(200, 2)) + 1j * rng.normal(size=(200, 2))
-    iq = s @ np.array(waves) + 0.05 * (rng.normal(size=(200, 8)) + 1j * rng.normal(size=(200, 8)))
-    covariance = spatial.sample_covariance(iq, 200)[:1]
-    vectors = array.steering(GRID, 8, 0.5)
-    for spectrum, peaks in (
-        (spatial.music_spectrum(covariance, vectors, sources=2)[0], 2),
-        (spatial.capon_spectrum(covariance, vectors)[0], 2),
-        (spatial.bartlett_spectrum(covariance, vectors)[0], 1),
-    ):
-        top = (spectrum[1:-1] > spectrum[:-2]) & (spectrum[1:-1] > spectrum[2:])
-        found = GRID[1:-1][top & (spectrum[1:-1] > 0.3 * spectrum.max())]
-        assert len(found) == peaks
-        if peaks == 2:
-            assert found == pytest.approx([0.1, 0.25], abs=0.01)
 
 
 def test_spectra_are_what_their_definitions_say():
@@ -293,9 +234,8 @@ def test_phase_difference_of_any_pair():
     u = np.linspace(-0.4, 0.4, 25)
     for pair, spacing, conjugate in (((0, 1), 0.5, False), ((3, 5), 0.3, True)):
         iq = plane_waves(u, spacing=spacing, noise=1e-6, conjugate=conjugate)
-        sines = spatial.phase_difference_sines(
-            iq, spacing, pair=pair, half_width=0, conjugate=conjugate
-        )
+        options = {'pair': pair, 'half_width': 0, 'conjugate': conjugate}
+        sines = spatial.phase_difference_sines(iq, spacing, **options)
         assert np.allclose(sines, u, atol=1e-4)
 
 
@@ -328,16 +268,13 @@ def test_errors_are_what_is_attainable(paper_pings, method):
         if method == 'phase':
             sine = spatial.phase_difference_sines(ping.iq, 0.5)
         else:
-            sine = spatial.peak_sines(
-                spatial.ping_spectrum(ping.iq, GRID, 0.5, method=method), GRID
-            )
+            spectrum = spatial.ping_spectrum(ping.iq, GRID, 0.5, method=method)
+            sine = spatial.peak_sines(spectrum, GRID)
         angle = np.arcsin(np.clip(sine, -1.0, 1.0))
-        height = HEIGHT - array.depth_of_angle(angle, ping.range, TILT)
-        error = np.square(height - true.height)
-        turn = np.square(np.degrees(angle - true.angle))
-        squares.append(
-            [error[~true.patch].mean(), error[true.patch].mean(), error.mean(), turn.mean()]
-        )
+        error = HEIGHT - array.depth_of_angle(angle, ping.range, TILT) - true.height
+        turn = np.degrees(angle - true.angle)
+        parts = error[~true.patch], error[true.patch], error, turn
+        squares.append([np.square(part).mean() for part in parts])
     rms = np.sqrt(np.mean(squares, axis=0))
     assert rms == pytest.approx(ATTAINABLE[method], rel=0.06)
 
@@ -370,7 +307,7 @@ def strongest(ranges, iq, first, last):
 
 
 @recorded
-def test_the_sphere_is_where_it_was_measured(split_beam):
+def test_the_sphere_is_where_it_was_measured_and_the_floor_straight_below(split_beam):
     ranges, iq, spacing = split_beam
     sphere = strongest(ranges, iq, 4.0, 8.0)
     assert ranges[sphere] == pytest.approx(5.79, abs=0.02)
@@ -379,15 +316,8 @@ def test_the_sphere_is_where_it_was_measured(split_beam):
     for half_width in (0, 2, 5):
         phase = spatial.phase_difference_sines(iq, spacing, half_width=half_width)[sphere]
         assert np.degrees(np.arcsin(phase)) == pytest.approx(2.2, abs=0.15)
-    # Both ways of looking at the same phase agree.
-    assert sine[0] == pytest.approx(
-        spatial.phase_difference_sines(iq, spacing, half_width=0)[sphere], abs=1e-4
-    )
-
-
-@recorded
-def test_the_floor_lies_straight_below(split_beam):
-    ranges, iq, spacing = split_beam
+        # Both ways of looking at the same phase agree.
+        assert half_width or sine[0] == pytest.approx(phase, abs=1e-4)
     floor = strongest(ranges, iq, 10.0, 13.9)
     assert 12.0 < ranges[floor] < 13.0
     phase = spatial.phase_difference_sines(iq, spacing)[floor]

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
@@ -76,14 +77,11 @@ def distance2(fix, truth):
     return float(gap @ np.linalg.solve(fix.covariance, gap))
 
 
-# -- statistics ----------------------------------------------------------------------------------
-
-
 @pytest.mark.statistics
-@pytest.mark.parametrize('kind', ['active', 'passive', 'bearings'])
-def test_errors_are_what_the_covariance_and_the_bound_say(kind):
+@pytest.mark.parametrize('kind, dof', [('active', 4), ('passive', 3), ('bearings', 10)])
+def test_errors_are_what_the_covariance_and_the_bound_say(kind, dof):
     runs, n, sigma_bearing = 300, 6, np.radians(0.3)
-    fixes, gaps = [], []
+    fixes, gaps, times = [], [], []
     for seed in range(runs):
         if kind == 'passive':
             scene = passive(n, sigma=SIGMA, seed=seed, emission=3.0)
@@ -91,14 +89,14 @@ def test_errors_are_what_the_covariance_and_the_bound_say(kind):
             scene = active(n, sigma=SIGMA, seed=seed)
         if kind == 'bearings':
             noise = sigma_bearing * np.random.default_rng(10_000 + seed).standard_normal(n)
-            scene.update(
-                bearing=multistatic.bearing(TRUTH, RX[:n]) + noise,
-                var_bearing=np.full(n, sigma_bearing**2),
-            )
+            scene['bearing'] = multistatic.bearing(TRUTH, RX[:n]) + noise
+            scene['var_bearing'] = np.full(n, sigma_bearing**2)
         fix = localise(**scene, limits=Limits(min_p_value=1e-9))
         assert isinstance(fix, Localisation) and not fix.ambiguous and fix.used.all()
         fixes.append(fix)
         gaps.append(fix.position - TRUTH)
+        if kind == 'passive':
+            times.append((fix.emission_time - 3.0) ** 2 / fix.var_emission_time)
     bound = crlb(n, kind, sigma_bearing)
     low, high = chi2.ppf([0.025, 0.975], 2 * runs) / runs
     assert low < np.mean([distance2(fix, TRUTH) for fix in fixes]) < high
@@ -106,19 +104,9 @@ def test_errors_are_what_the_covariance_and_the_bound_say(kind):
     mean = np.mean([fix.covariance for fix in fixes], axis=0)
     assert_allclose(mean, bound, rtol=0.02, atol=1e-3 * np.trace(bound))
     assert kstest([fix.p_value for fix in fixes], 'uniform').pvalue > 0.01
-    dof = {'active': 4, 'passive': 3, 'bearings': 10}[kind]
     assert {fix.dof for fix in fixes} == {dof}
     assert low * dof / 2 * 0.9 < np.mean([fix.cost for fix in fixes]) < high * dof / 2 * 1.1
-
-
-def test_emission_time_of_a_tag():
-    gaps = []
-    for seed in range(200):
-        fix = localise(**passive(6, sigma=SIGMA, seed=seed, emission=12.5))
-        gaps.append((fix.emission_time - 12.5) / np.sqrt(fix.var_emission_time))
-    low, high = chi2.ppf([0.025, 0.975], 200) / 200
-    assert low < np.mean(np.square(gaps)) < high
-    assert localise(**active(4)).emission_time is None
+    assert not times or 0.8 < np.mean(times) < 1.2
 
 
 def test_passive_fix_minimises_the_augmented_sum_of_squares():
@@ -136,52 +124,39 @@ def test_passive_fix_minimises_the_augmented_sum_of_squares():
     covariance = np.linalg.inv(joint.jac.T @ joint.jac)
     assert_allclose(fix.covariance, covariance[:2, :2], rtol=1e-4)
     assert fix.var_emission_time == pytest.approx(covariance[2, 2] / SOUND_SPEED**2, rel=1e-3)
+    assert localise(**active(4)).emission_time is None
 
 
-@settings(max_examples=40, derandomize=True, deadline=None)
-@given(
-    angle=st.floats(-4.0, 4.0),
-    east=st.floats(-1e4, 1e4),
-    north=st.floats(-1e4, 1e4),
-    order=st.permutations(range(5)),
-    tag=st.booleans(),
-)
-def test_fix_turns_and_moves_with_the_scene(angle, east, north, order, tag):
-    more = {'sigma': SIGMA, 'seed': 8}
-    scene = passive(5, emission=4.0, **more) if tag else active(5, **more)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    moved = dict(scene)
-    for name in ('rx', 'tx', 'toa', 'var_toa'):
-        if name in scene:
-            moved[name] = scene[name][list(order)]
-    for name in {'rx', 'tx'} & set(scene):
-        moved[name][:, :2] = moved[name][:, :2] @ turn.T + [east, north]
-    first, second = localise(**scene), localise(**moved)
-    assert_allclose(second.position, turn @ first.position + [east, north], atol=1e-3)
-    assert_allclose(second.covariance, turn @ first.covariance @ turn.T, atol=1e-4)
+@pytest.mark.parametrize('make', [active, passive])
+def test_fix_turns_and_moves_with_the_scene(make):
+    scene, rng = make(5, sigma=SIGMA, seed=8), np.random.default_rng(1)
+    first, names = localise(**scene), {'rx', 'tx', 'toa', 'var_toa'} & set(scene)
+    for angle in (-3.0, -0.4, 1.2):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        shift, order = rng.uniform(-1e4, 1e4, 2), rng.permutation(5)
+        moved = {**scene, **{name: scene[name][order] for name in names}}
+        for name in {'rx', 'tx'} & names:
+            moved[name][:, :2] = moved[name][:, :2] @ turn.T + shift
+        second = localise(**moved)
+        assert_allclose(second.position, turn @ first.position + shift, atol=1e-3)
+        assert_allclose(second.covariance, turn @ first.covariance @ turn.T, atol=1e-4)
 
 
 def test_two_transmitters_and_a_mixture_of_active_and_passive_rows():
-    tx = np.vstack([np.tile(TX, (2, 1)), np.tile([60.0, -40.0, -1.0], (2, 1))])
-    toa = multistatic.range_sum(TRUTH, tx, RX[:4], Z) / SOUND_SPEED
-    fix = localise(RX[:4], toa, np.full(4, SIGMA**2), tx=tx, target_z=Z)
+    tx = np.repeat([TX, [60.0, -40.0, -1.0], np.full(3, np.nan)], (2, 2, 4), axis=0)
+    toa = multistatic.range_sum(TRUTH, tx[:4], RX[:4], Z) / SOUND_SPEED
+    known = {'target_z': Z}
+    fix = localise(RX[:4], toa, np.full(4, SIGMA**2), tx=tx[:4], **known)
     assert_allclose(fix.position, TRUTH, atol=1e-3)
-    toa = np.append(toa[:2], multistatic.slant_range(TRUTH, RX[2:6], Z)[0] / 1500.0 + 0.3)
-    tx = np.append(tx[:2], np.full((4, 3), np.nan), axis=0)
-    fix = localise(RX[:6], toa, np.full(6, SIGMA**2), tx=tx, target_z=Z)
+    toa = np.append(toa[:2], multistatic.slant_range(TRUTH, RX[2:6], Z)[0] / SOUND_SPEED + 0.3)
+    fix = localise(RX[:6], toa, np.full(6, SIGMA**2), tx=tx[[0, 1, 4, 5, 6, 7]], **known)
     assert_allclose(fix.position, TRUTH, atol=1e-3)
     assert fix.dof == 3 and fix.emission_time == pytest.approx(0.3, abs=1e-6)
-
-
-def test_bearings_alone_triangulate():
-    bearing = multistatic.bearing(TRUTH, RX[:3])
-    nothing = np.full(3, np.nan)
+    # Bearings alone triangulate.
+    bearing, nothing = multistatic.bearing(TRUTH, RX[:3]), np.full(3, np.nan)
     fix = localise(RX[:3], nothing, nothing, bearing=bearing, var_bearing=np.full(3, 1e-4))
     assert_allclose(fix.position, TRUTH, atol=1e-3)
     assert not fix.used.any() and fix.used_bearing.all() and fix.dof == 1
-
-
-# -- ghosts --------------------------------------------------------------------------------------
 
 
 def crossings(tx, rx, toa):
@@ -207,30 +182,22 @@ def matches(fix, expected):
 
 
 def test_two_ellipses_cross_twice_and_both_positions_are_told():
-    rx, tx = RX * LEVEL + HEIGHT, TX * LEVEL + HEIGHT
-    scene = active(2, tx=tx, rx=rx)
+    scene = active(2, tx=TX * LEVEL + HEIGHT, rx=RX * LEVEL + HEIGHT)
     expected = crossings(scene['tx'], scene['rx'], scene['toa'])
     assert len(expected) == 2
     fix = localise(**scene)
-    assert fix.ambiguous and fix.dof == 0 and fix.p_value == 1.0
-    assert matches(fix, expected)
-    for other in (fix, *fix.alternatives):
-        sums = multistatic.range_sum(other.position, scene['tx'], scene['rx'], Z)
-        assert_allclose(sums, SOUND_SPEED * scene['toa'], atol=1e-4)
+    assert fix.ambiguous and fix.dof == 0 and fix.p_value == 1.0 and matches(fix, expected)
     refused = localise(**scene, limits=Limits(refuse_ambiguous=True))
     assert refused.reason == 'ambiguous' and len(refused.alternatives) == 2
-
-
-def test_two_ellipses_without_a_common_focus_cross_four_times():
+    # Without a common focus they cross four times.
     tx = np.array([[-60.0, 0.0, Z], [0.0, -60.0, Z]])
-    toa = np.full(2, 170.0 / SOUND_SPEED)
-    expected = crossings(tx, -tx * [1, 1, -1], toa)
-    assert len(expected) == 4
-    fix = localise(-tx * [1, 1, -1], toa, np.full(2, SIGMA**2), tx=tx, target_z=Z)
-    assert fix.ambiguous and len(fix.alternatives) == 3 and matches(fix, expected)
+    rx, toa = -tx * [1, 1, -1], np.full(2, 170.0 / SOUND_SPEED)
+    expected = crossings(tx, rx, toa)
+    fix = localise(rx, toa, np.full(2, SIGMA**2), tx=tx, target_z=Z)
+    assert fix.ambiguous and len(expected) == 4 and matches(fix, expected)
 
 
-@pytest.mark.parametrize('seed', range(30))
+@pytest.mark.parametrize('seed', range(10))
 def test_truth_is_the_fix_or_one_of_its_ghosts(seed):
     rng = np.random.default_rng(seed)
     rx = np.column_stack([rng.uniform(-100, 100, (3, 2)), rng.uniform(-9, -1, 3)])
@@ -244,33 +211,23 @@ def test_truth_is_the_fix_or_one_of_its_ghosts(seed):
         assert min(np.linalg.norm(found - truth, axis=-1)) < 0.05
 
 
-def test_a_third_receiver_or_a_bearing_settles_it():
+def test_a_third_receiver_or_a_bearing_settles_it_and_a_line_leaves_left_and_right_open():
     assert not localise(**active(3, sigma=SIGMA)).ambiguous
     scene = active(2, bearing=multistatic.bearing(TRUTH, RX[:2]), var_bearing=np.full(2, 1e-3))
     fix = localise(**scene)
     assert not fix.ambiguous
     assert_allclose(fix.position, TRUTH, atol=1e-3)
-
-
-def test_receivers_in_a_line_leave_left_and_right_open():
     rx = np.array([[x, 0.0, Z] for x in (-60.0, -20.0, 15.0, 70.0)])
     for scene in (passive(4, rx=rx), active(4, rx=rx, tx=np.array([5.0, 0.0, Z]))):
         fix = localise(**scene)
         assert fix.ambiguous and matches(fix, np.array([TRUTH, TRUTH * [1, -1]]))
 
 
-# -- singular geometry ---------------------------------------------------------------------------
-
-
 def test_target_between_transmitter_and_receivers_in_line_is_refused():
-    rx = np.array([[100.0, 0.0, Z], [140.0, 0.0, Z], [170.0, 0.0, Z]])
-    for seed in range(50):
-        scene = active(
-            3, np.array([40.0, 0.0]), tx=np.array([0.0, 0.0, Z]), rx=rx, sigma=SIGMA, seed=seed
-        )
-        refusal = localise(**scene)
-        assert isinstance(refusal, Refusal)
-        assert refusal.reason in ('singular_geometry', 'diverged')
+    tx, rx = np.array([0.0, 0.0, Z]), np.array([[x, 0.0, Z] for x in (100.0, 140.0, 170.0)])
+    for seed in range(20):
+        scene = active(3, np.array([40.0, 0.0]), tx=tx, rx=rx, sigma=SIGMA, seed=seed)
+        assert localise(**scene).reason in ('singular_geometry', 'diverged')
 
 
 def test_near_a_baseline_a_fix_is_refused_or_near():
@@ -304,19 +261,9 @@ def test_limits():
         assert isinstance(localise(**scene), wanted)
 
 
-# -- reflections ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     'make, n, late',
-    [
-        (active, 4, [2]),
-        (active, 6, [0]),
-        (active, 8, [1, 4]),
-        (active, 8, [0, 2, 5]),
-        (passive, 6, [3]),
-        (passive, 8, [0, 6]),
-    ],
+    [(active, 4, [2]), (active, 8, [0, 2, 5]), (passive, 6, [3]), (passive, 8, [0, 6])],
 )
 def test_late_reflections_are_left_out(make, n, late):
     for seed in range(8):
@@ -325,14 +272,13 @@ def test_late_reflections_are_left_out(make, n, late):
         scene['toa'][late] += np.linspace(4e-3, 9e-3, len(late))
         fix = localise(**scene)
         assert_array_equal(np.flatnonzero(~fix.used), late)
-        assert not fix.ambiguous
-        assert distance2(fix, TRUTH) < 25.0
+        assert not fix.ambiguous and distance2(fix, TRUTH) < 25.0
         assert fix.dof == n - len(late) - (2 if make is active else 3)
         alone = localise(**{**scene, 'var_toa': np.where(fix.used, SIGMA**2, np.nan)})
         assert_allclose(fix.position, alone.position, atol=1e-4)
 
 
-@pytest.mark.parametrize('seed', [56, 65, 74, 214, 248])
+@pytest.mark.parametrize('seed', [56, 214, 248])
 def test_the_search_starts_afresh_without_a_reflection(seed):
     """In these scenes the reflection bends the sum of squares so far that no old minimum helps."""
     rng = np.random.default_rng(seed)
@@ -374,9 +320,6 @@ def test_two_ways_to_leave_a_row_out_are_ambiguous():
     assert matches(fix, np.array([TRUTH, mirror]))
 
 
-# -- input ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize('scene', [active(1), passive(2), passive(1), active(0), passive(0)])
 def test_too_few(scene):
     assert localise(**scene).reason == 'too_few'
@@ -390,53 +333,31 @@ def test_rows_that_are_not_measured_are_not_used():
     fix = localise(**scene)
     assert_array_equal(fix.used, [True] * 4 + [False] * 2)
     assert_allclose(fix.position, good.position, atol=1e-4)
+    for infinity in (np.inf, -1e300):
+        scene = active(5, sigma=SIGMA, seed=4)
+        scene['tx'][1, 0] = infinity
+        fix = localise(**scene)
+        assert_array_equal(fix.used, [True, False, True, True, True])
+        assert fix.emission_time is None and distance2(fix, TRUTH) < 25.0
 
 
-@pytest.mark.parametrize('place', [np.inf, -1e300])
-def test_a_transmitter_at_infinity_is_not_used(place):
-    scene = active(5, sigma=SIGMA, seed=4)
-    scene['tx'][1, 0] = place
-    fix = localise(**scene)
-    assert_array_equal(fix.used, [True, False, True, True, True])
-    assert fix.emission_time is None and distance2(fix, TRUTH) < 25.0
+def test_arrays_that_do_not_fit_raise():
+    wrong = {'toa': np.zeros(3), 'tx': np.zeros((3, 3)), 'bearing': np.zeros(5), 'var_toa': 1e-8}
+    for name, value in (*wrong.items(), ('rx', np.zeros((4, 2))), ('rx', np.full((4, 3), np.nan))):
+        with pytest.raises(ValueError, match='receiver|every arrival'):
+            localise(**{**active(4), name: value})
 
 
-@pytest.mark.parametrize(
-    'change',
-    [
-        {'toa': np.zeros(3)},
-        {'tx': np.zeros((3, 3))},
-        {'rx': np.zeros((4, 2))},
-        {'bearing': np.zeros(5)},
-        {'rx': np.full((4, 3), np.nan)},
-        {'var_toa': 1e-8},
-    ],
-)
-def test_arrays_that_do_not_fit_raise(change):
-    with pytest.raises(ValueError, match='receiver|every arrival'):
-        localise(**{**active(4), **change})
-
-
-ANY = st.one_of(
-    st.floats(),
-    st.sampled_from([0.0, 1e-320, 1e308, -1e308, 1e-9, 0.05, np.nan]),
-    st.floats(0.0, 0.2),
-)
+ANY = st.floats() | st.sampled_from([0.0, 1e-320, 1e308, -1e308, 1e-9, 0.05]) | st.floats(0.0, 0.2)
 
 
 @settings(max_examples=150, derandomize=True, deadline=None)
-@given(
-    st.integers(0, 6).flatmap(
-        lambda n: st.tuples(
-            *(st.lists(ANY, min_size=n, max_size=n) for _ in range(4)),
-            st.lists(st.floats(-1e8, 1e8), min_size=6 * n, max_size=6 * n),
-            st.booleans(),
-        )
+@given(st.data(), st.integers(0, 6), st.booleans())
+def test_no_input_raises_or_gives_nan(data, n, tag):
+    toa, var_toa, bearing, var_bearing = (
+        data.draw(st.lists(ANY, min_size=n, max_size=n)) for _ in range(4)
     )
-)
-def test_no_input_raises_or_gives_nan(data):
-    toa, var_toa, bearing, var_bearing, places, tag = data
-    rx, tx = np.reshape(places, (2, len(toa), 3))
+    rx, tx = data.draw(arrays(float, (2, n, 3), elements=st.floats(-1e8, 1e8)))
     tx[:1] *= 1e300
     angles = {'bearing': bearing, 'var_bearing': var_bearing}
     result = localise(rx, toa, var_toa, tx=None if tag else tx, **angles)
@@ -450,14 +371,11 @@ def test_no_input_raises_or_gives_nan(data):
 
 def test_the_distance_from_a_fix_needs_no_inverse():
     """Two rows alike: rounding has left nothing of what is known across them."""
-    for scale in (1e-20, 1e-4, 1.0, 1e20):
-        covariance = scale * np.array([[1.0, 1.0], [1.0, 1.0]])
-        with pytest.raises(np.linalg.LinAlgError):
-            np.linalg.inv(covariance)
-        candidate = Candidate(np.zeros(2), covariance, 0.0)
-        step = np.sqrt(scale) * np.array([1.0, 1.0])
+    for scale in (1e-20, 1.0, 1e20):
+        candidate = Candidate(np.zeros(2), scale * np.ones((2, 2)), 0.0)
+        step = np.sqrt(scale) * np.ones(2)
         np.testing.assert_allclose(candidate.distance2(step), 1.0, rtol=1e-9)
-        assert candidate.distance2(np.sqrt(scale) * np.array([1.0, -1.0])) > 1e12
+        assert candidate.distance2(step * [1.0, -1.0]) > 1e12
     rng = np.random.default_rng(2)
     for _ in range(50):
         root, gap = rng.normal(size=(2, 2)), rng.normal(size=2)
@@ -488,13 +406,12 @@ def table(name):
 def results():
     arrivals, receivers = table('arrivals.csv'), table('receivers.csv')
     places = np.column_stack([receivers[:, 1:3], -receivers[:, 3]])
-    return [
-        localise(
-            places[rows[:, 1].astype(int)], rows[:, 2], np.full(len(rows), SIGMA_TOA**2),
-            target_z=TAG_Z, sound_speed=RECORDED_SPEED,
-        )
-        for rows in (arrivals[arrivals[:, 0] == ping] for ping in np.unique(arrivals[:, 0]))
-    ]  # fmt: skip
+    known, found = {'target_z': TAG_Z, 'sound_speed': RECORDED_SPEED}, []
+    for ping in np.unique(arrivals[:, 0]):
+        _, receiver, toa = arrivals[arrivals[:, 0] == ping, :3].T
+        variance = np.full(len(toa), SIGMA_TOA**2)
+        found.append(localise(places[receiver.astype(int)], toa, variance, **known))
+    return found
 
 
 @pytest.fixture(scope='module')
@@ -511,13 +428,9 @@ def gps_errors(stamps, positions, lag=0.0):
 
 
 @recorded
-def test_every_ping_of_four_receivers_gives_a_fix(results, fixes):
+def test_every_ping_of_four_receivers_gives_a_fix_with_residuals_as_the_noise_says(results, fixes):
     assert len(fixes) == 119
     assert {each.reason for each in results if each not in fixes} == {'too_few'}
-
-
-@recorded
-def test_residuals_are_what_the_noise_says(fixes):
     ratio = sum(fix.cost for fix in fixes) / sum(fix.dof for fix in fixes)
     assert 0.85 < ratio < 1.15
     assert sum((~fix.used).sum() for fix in fixes) <= 10

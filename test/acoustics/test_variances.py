@@ -9,9 +9,11 @@
 """Powers of echoes and noise, and the staves of an array from its echoes: against vectors made
 independently, the scene of the paper, and errors that are put in."""
 
+from itertools import product
 import math
-from pathlib import Path
 
+from attrs import evolve
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -27,7 +29,7 @@ from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, 
 @pytest.fixture(scope='module')
 def pings():
     scene = simulate(scenario('paper', {'pings': 12}), 7)
-    return [(entry.measurement, true) for entry, true in zip(scene.measurements, scene.truth)]
+    return [entry.measurement for entry in scene.measurements]
 
 
 def test_moving_mean_over_usable_rows_only():
@@ -49,25 +51,23 @@ def test_which_bins_are_usable():
 
 def test_the_signal_is_known_to_two_decibels(pings):
     config = scenario('paper')
-    errors = [
+    found = [
         variances.signal_variance(variances.mean_power(ping.iq), 1.0) / snr(config, ping.range)
-        for ping, _ in pings
+        for ping in pings
     ]
-    decibels = 10.0 * np.log10(np.concatenate(errors))
+    decibels = 10.0 * np.log10(np.concatenate(found))
     assert abs(decibels.mean()) < 0.5 and decibels.std() < 2.0
+    blind = [variances.blind_noise_variance(ping.iq) for ping in pings]
+    assert np.abs(10.0 * np.log10(blind)).max() < 2.0
+    assert np.isnan(variances.blind_noise_variance(pings[0].iq[:5]))
 
 
 def test_silence_leaves_a_floor_and_spoilt_bins_do_not_count(pings):
-    ping, _ = pings[0]
-    noise = np.full(len(ping), 1e9)
-    floor = variances.signal_variance(variances.mean_power(ping.iq), noise)
+    power = variances.mean_power(pings[0].iq)
+    floor = variances.signal_variance(power, np.full(len(power), 1e9))
     assert (floor == variances.LEAST_SNR * 1e9).all()
-    power = variances.mean_power(ping.iq)
-    clean = variances.signal_variance(power, 1.0)
-    usable = np.ones(len(ping), bool)
-    usable[500] = False
-    spoilt = power.copy()
-    spoilt[500] = np.nan
+    clean, spoilt, usable = variances.signal_variance(power, 1.0), power.copy(), power > 0.0
+    spoilt[500], usable[500] = np.nan, False
     found = variances.signal_variance(spoilt, 1.0, usable=usable)
     assert np.isfinite(found).all() and np.abs(10.0 * np.log10(found / clean)).max() < 6.0
     assert (found[:490] == clean[:490]).all()
@@ -81,44 +81,36 @@ def test_noise_from_the_water_column():
     assert np.isnan(variances.noise_variance(ping.iq, ping.range < 0.0))
 
 
-def test_blind_noise_is_right_within_two_decibels(pings):
-    found = [variances.blind_noise_variance(ping.iq) for ping, _ in pings]
-    assert np.abs(10.0 * np.log10(found)).max() < 2.0
-    assert np.isnan(variances.blind_noise_variance(pings[0][0].iq[:5]))
-
-
 def test_blind_noise_is_that_beside_one_echo_which_takes_a_share_of_it():
     rng = np.random.default_rng(6)
-    parts = rng.normal(size=(20_000, 7, 2)).view(np.complex128)[..., 0] / np.sqrt(2.0)
-    iq = parts[:, :6] + 30.0 * parts[:, 6:] * np.exp(0.4j * np.arange(6))
+    iq = circular(rng, 20_000, 6)
+    iq += 30.0 * circular(rng, 20_000, 1) * np.exp(0.4j * np.arange(6))
     iq *= np.sqrt(rng.exponential(size=(20_000, 1)))
-    for half_width in (2, 4, 7):
+    for half_width in (2, 7):
         assert variances.blind_noise_variance(iq, half_width) == pytest.approx(1.0, rel=0.06)
 
 
 @pytest.mark.filterwarnings('error')
-@pytest.mark.parametrize('unit', [1e-30, 1e-9, 3.0, 1e9, 1e17])
+@pytest.mark.parametrize('unit', [1e-30, 3.0, 1e17])
 def test_the_unit_of_samples_changes_no_decorrelation(unit):
     """Samples come in single precision, whose range their fourth powers leave."""
-    rng = np.random.default_rng(5)
-    echo = rng.normal(size=(60, 1)) + 1j * rng.normal(size=(60, 1))
-    own = rng.normal(size=(60, 4)) + 1j * rng.normal(size=(60, 4))
-    iq = echo + 0.5 * own
+    rng, every = np.random.default_rng(5), np.ones(60, bool)
+    iq = np.sqrt(2.0) * (circular(rng, 60, 1) + 0.5 * circular(rng, 60, 4))
     iq[20:40] = 0.0  # silence says nothing
-    every = np.ones(60, bool)
-    known = variances.decorrelation(iq.astype(np.complex64), every)
-    assert 0.05 < known < 0.5
-    assert variances.decorrelation((unit * iq).astype(np.complex64), every) == pytest.approx(
-        known, rel=1e-4
+    known, found = (
+        variances.decorrelation((each * iq).astype(np.complex64), every) for each in (1.0, unit)
     )
+    assert 0.05 < known < 0.5 and found == pytest.approx(known, rel=1e-4)
     assert np.isnan(variances.decorrelation(0.0 * iq, every))
 
 
+def fading_noise(rng, bins, staves):
+    noise = rng.normal(size=(bins, staves, 2)).view(np.complex128)[..., 0]
+    return noise * np.sqrt(rng.exponential(size=(bins, 1)))
+
+
 def test_loud_stretches_of_the_water_are_no_noise():
-    rng = np.random.default_rng(3)
-    noise = rng.normal(size=(400, 4, 2)).view(np.complex128)[..., 0]
-    noise *= np.sqrt(rng.exponential(size=(400, 1)))
-    quiet = np.arange(400) < 320
+    noise, quiet = fading_noise(np.random.default_rng(3), 400, 4), np.arange(400) < 320
     assert (variances.quiet_stretches(noise, quiet) == quiet).all()
     spoilt = noise.copy()
     spoilt[:60] *= 1e3  # the transmit pulse
@@ -133,14 +125,11 @@ def test_loud_stretches_of_the_water_are_no_noise():
     assert not kept[:224].any() and kept[224:320].all()
 
 
-@pytest.mark.parametrize('staves', [2, 8])
-def test_a_water_column_of_fading_noise_is_kept_whole(staves):
+def test_a_water_column_of_fading_noise_is_kept_whole():
     rng = np.random.default_rng(4)
-    for bins in (40, 150, 1500):
-        for _ in range(40):
-            noise = rng.normal(size=(bins, staves, 2)).view(np.complex128)[..., 0]
-            noise *= np.sqrt(rng.exponential(size=(bins, 1)))
-            assert variances.quiet_stretches(noise, np.ones(bins, bool)).all()
+    for _, bins, staves in product(range(30), (40, 150, 1500), (2, 8)):
+        noise = fading_noise(rng, bins, staves)
+        assert variances.quiet_stretches(noise, np.ones(bins, bool)).all()
 
 
 @pytest.mark.parametrize('apart, differ', [(5, True), (6, False)])
@@ -160,7 +149,7 @@ def noise_power(rng, bins, staves, *, fading=True):
     return power * rng.exponential(size=bins) if fading else power
 
 
-@pytest.mark.parametrize('staves', [1, 2, 3, 8, 64])
+@pytest.mark.parametrize('staves', [1, 8, 64])
 def test_the_law_of_fading_noise_is_that_of_its_integral(staves):
     for level in (0.01, 0.5, 2.0, 9.0):
         exact, _ = quad(
@@ -171,7 +160,7 @@ def test_the_law_of_fading_noise_is_that_of_its_integral(staves):
     assert 0.0 <= loudness.noise_exceeds(1e9, staves) < 1e-300
 
 
-@pytest.mark.parametrize('staves', [2, 3, 8])
+@pytest.mark.parametrize('staves', [2, 8])
 def test_levels_let_pass_as_much_noise_as_asked(staves):
     rng = np.random.default_rng(1)
     power = noise_power(rng, 500_000, staves).reshape(-1, 5)
@@ -215,28 +204,21 @@ def test_a_loud_stretch_that_is_not_coherent_is_a_diffuse_floor_and_a_spike_is_n
     rng = np.random.default_rng(3)
     ratio, usable = 1e4 * noise_power(rng, 600, 8), np.ones(600, bool)
     ratio[:200] = noise_power(rng, 200, 8)
-    silent = np.zeros(600, bool)
-    silent[:200] = True  # a shadow
-    silent[200:400] = rng.random(200) < 0.8  # a diffuse floor
-    silent[400:] = rng.random(200) < 0.1  # spikes on a coherent one
+    # A shadow, a diffuse floor, and spikes on a coherent one.
+    silent = rng.random(600) < np.repeat([1.0, 0.8, 0.1], 200)
     found = loudness.diffuse_bins(ratio, silent, usable)
     assert not found[:200].any() and found[215:385].mean() > 0.9 and not found[415:].any()
-
-
-def test_noise_is_never_very_loud_20_db_are():
-    incoherent, usable = np.ones(200, bool), np.ones(200, bool)
-    assert not loudness.diffuse_bins(np.full(200, 90.0), incoherent, usable).any()
-    assert loudness.diffuse_bins(np.full(200, 110.0), incoherent, usable).all()
+    # Noise is never very loud, 20 dB are.
+    for level, loud in ((90.0, False), (110.0, True)):
+        found = loudness.diffuse_bins(np.full(200, level), np.ones(200, bool), np.ones(200, bool))
+        assert (found == loud).all()
 
 
 def diffuse(rng, bins, staves, share, *, snr=1e4):
-    def circular(*shape):
-        return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2.0)
-
-    wave = np.sqrt(1.0 - share) * circular(bins, 1) * np.exp(0.7j * np.arange(staves))
-    wave = wave + np.sqrt(share) * circular(bins, staves)
+    wave = np.sqrt(1.0 - share) * circular(rng, bins, 1) * np.exp(0.7j * np.arange(staves))
+    wave = wave + np.sqrt(share) * circular(rng, bins, staves)
     fading = np.sqrt(rng.exponential(size=(bins, 1)))
-    return fading * (np.sqrt(snr) * wave + circular(bins, staves))
+    return fading * (np.sqrt(snr) * wave + circular(rng, bins, staves))
 
 
 @pytest.mark.parametrize('staves', [2, 8])
@@ -251,10 +233,6 @@ def test_the_share_that_differs_from_stave_to_stave_is_measured(staves):
     chosen = np.isfinite(iq).all(axis=1) & (np.arange(2000) != 7)
     assert np.isfinite(variances.decorrelation(iq, chosen))
     assert np.isnan(variances.decorrelation(iq, np.zeros(2000, bool)))
-
-
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry_by_default' / 'array.npz'
-EVERY = np.ones(1200, bool)
 
 
 def circular(rng, *shape):
@@ -282,31 +260,28 @@ def without_line(phase, live):
 
 
 def test_gain_phase_and_what_is_live_are_those_of_the_vectors():
-    with np.load(VECTORS) as case:
-        live, phase = case['live'], case['phase']
-        true = case['gain_true'] / np.median(case['gain_true'][live])
-        iq = case['iq'][..., 0].astype(float) + 1j * case['iq'][..., 1].astype(float)
-        found = [measured(ping) for ping in iq]
-        for each in found:
-            assert (each.live == live).all() and each.bins > 700
-            assert np.degrees(np.abs(each.phase - phase)[live]).max() < 0.6
-            assert each.gain[live] == pytest.approx(true[live], rel=0.025)
-            assert each.coherence[live].min() > 0.97 and each.coherence[~live].max() < 0.35
-            # The vectors have the root mean square, here it is that of phases beside a line.
-            tilt = float(case['phase_tilt']) * math.sqrt(7.0 / 3.0)
-            assert each.sine_std == pytest.approx(tilt, rel=0.03)
-        # To the reach of the vectors, of three pings.
-        assert np.mean([c.gain[live] for c in found], axis=0) == pytest.approx(
-            true[live], rel=0.01
-        )
-        off = np.mean([c.phase for c in found], axis=0) - phase
-        assert np.degrees(np.abs(off[live])).max() < 0.3
+    case = load_vectors('bathymetry_by_default/array')
+    live, phase = case['live'], case['phase']
+    true = case['gain_true'] / np.median(case['gain_true'][live])
+    found = [measured(ping) for ping in case['iq'].astype(float) @ [1.0, 1j]]
+    for each in found:
+        assert (each.live == live).all() and each.bins > 700
+        assert np.degrees(np.abs(each.phase - phase)[live]).max() < 0.6
+        assert each.gain[live] == pytest.approx(true[live], rel=0.025)
+        assert each.coherence[live].min() > 0.97 and each.coherence[~live].max() < 0.35
+        # The vectors have the root mean square, here it is that of phases beside a line.
+        tilt = float(case['phase_tilt']) * math.sqrt(7.0 / 3.0)
+        assert each.sine_std == pytest.approx(tilt, rel=0.03)
+    # To the reach of the vectors, of three pings.
+    gain, mean = (np.mean([getattr(c, name) for c in found], axis=0) for name in ('gain', 'phase'))
+    assert gain[live] == pytest.approx(true[live], rel=0.01)
+    assert np.degrees(np.abs((mean - phase)[live])).max() < 0.3
 
 
 @pytest.mark.parametrize('staves, spacing', [(4, 0.5), (8, 2.0), (8, 0.2), (17, 0.5)])
 @pytest.mark.parametrize('noise', [1.0, None])
 def test_an_exact_array_stays_as_it_is_to_the_bit(staves, spacing, noise):
-    for seed in range(4):
+    for seed in range(2):
         iq = echoes(staves, seed=seed, spacing=spacing)
         found = measured(iq, spacing, noise)
         assert found.is_exact and found.apply(iq) is iq and found.weights is None
@@ -327,14 +302,11 @@ def test_gains_and_phases_are_measured_and_taken_off():
     assert turned == pytest.approx(1.0, rel=0.02)
     wide = 2.0 * math.pi * 0.5 * math.sqrt(42.0)
     assert found.sine_std == pytest.approx(math.sqrt(np.sum(found.phase**2) / 4.0) / wide)
+    # A phase that grows evenly is a tilt and stays.
+    assert measured(iq * np.exp(0.1j * np.arange(8))).is_exact
 
 
-def test_a_phase_that_grows_evenly_is_a_tilt_and_stays():
-    iq = echoes() * np.exp(0.1j * np.arange(8))
-    assert measured(iq).is_exact
-
-
-@pytest.mark.parametrize('stave', [0, 3, 7])
+@pytest.mark.parametrize('stave', [0, 3])
 def test_dead_deaf_and_inverted_staves_are_found(stave):
     iq, others = echoes(), np.arange(8) != stave
     dead, deaf, inverted = iq.copy(), iq.copy(), iq.copy()
@@ -352,11 +324,8 @@ def test_dead_deaf_and_inverted_staves_are_found(stave):
     assert found.apply(inverted) == pytest.approx(iq, rel=0.1, abs=0.1)
 
 
-@pytest.mark.parametrize('pairs', [((2, 3),), ((1, 6),), ((0, 1), (5, 7))])
-def test_exchanged_staves_are_put_back(pairs):
-    order = np.arange(8)
-    for a, b in pairs:
-        order[[a, b]] = order[[b, a]]
+@pytest.mark.parametrize('order', [[0, 6, 2, 3, 4, 5, 1, 7], [1, 0, 2, 3, 4, 7, 6, 5]])
+def test_exchanged_staves_are_put_back(order):
     iq = echoes()
     found = measured(iq[:, order])
     assert (found.order == order).all() and not found.no_wave.any()
@@ -365,8 +334,7 @@ def test_exchanged_staves_are_put_back(pairs):
 
 def test_a_stave_at_another_place_is_named_and_not_exchanged():
     iq = echoes()
-    rng = np.random.default_rng(2)
-    iq[:, 4] *= np.exp(0.9j * rng.normal(size=len(iq)))
+    iq[:, 4] *= np.exp(0.9j * np.random.default_rng(2).normal(size=len(iq)))
     found = measured(iq)
     assert np.flatnonzero(found.no_wave).tolist() == [4]
     assert (found.order == np.arange(8)).all() and found.live.all()
@@ -402,19 +370,16 @@ def test_what_shows_no_array_leaves_it_alone():
     many_ways = echoes() + turn * echoes(seed=2) + turn.conj() * echoes(seed=3)
     for iq in (noise, few, many_ways, echoes(3)):
         assert measured(iq).is_exact and measured(iq).weights is None
-    assert calibrate(noise, EVERY, 0.5, None).is_exact
+    assert measured(noise, noise=None).is_exact
 
 
-@pytest.mark.parametrize('dead', [(), (2,), (0, 5)])
+@pytest.mark.parametrize('dead', [(), (0, 5)])
 def test_the_form_with_weights_is_that_of_the_covariance(dead):
     rng = np.random.default_rng(6)
     staves, signal = 7, 3.7
     live = ~np.isin(np.arange(staves), dead)
     noise = np.where(live, rng.uniform(0.3, 4.0, staves), 1.0)
-    exact = Calibration.exact(staves)
-    one = Calibration(
-        live, exact.gain, exact.phase, exact.coherence, noise, exact.order, exact.no_wave
-    )
+    one = evolve(Calibration.exact(staves), live=live, noise=noise)
     y = np.where(live, circular(rng, 5, staves), 0.0)
     step = array.phase_step(0.5)
     level = np.full(5, one.level)

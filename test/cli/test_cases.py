@@ -58,7 +58,7 @@ ELSEWHERE = [
     'cli/test_info.py a_type_that_nobody_hears_names_what_would_do',
     'cli/test_names.py any_locale_will_do',
     'cli/test_stranger.py a_recording_keeps_no_files_and_changes_no_node',
-    'trackers/test_hostile_state.py a_file_runs_no_program',
+    'trackers/test_state.py a_file_runs_no_program',
     'cli/test_stranger.py a_file_that_a_recording_names_lies_beside_it',
     'recordings/convert/test_segy_headers.py the_recording_delay_of_each_trace',
     'recordings/convert/test_segy_headers.py the_sample_interval_of_each_trace_or_of_the_file',

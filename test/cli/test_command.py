@@ -20,58 +20,57 @@ import pytest
 from sonar_imm import __version__
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import COMMANDS, main
+from sonar_imm_tools.cli.common import load_detector
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.mark.parametrize('arguments', [[], ['--help'], ['-h']])
-def test_help_lists_every_command(arguments, capsys):
-    assert main(arguments) == 0
-    printed = capsys.readouterr().out
-    assert all(f'  {name} ' in printed for name in COMMANDS)
-
-
-def test_help_fits_a_screen_of_24_lines_and_80_columns(monkeypatch, capsys):
+def test_help_lists_every_command_on_a_screen_of_24_lines_and_80_columns(monkeypatch, capsys):
     monkeypatch.setenv('COLUMNS', '80')
-    assert main(['--help']) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) < 24 and max(map(len, lines)) <= 80  # the prompt takes one line
-    assert '--version' in lines[0]
-
-
-@pytest.mark.parametrize('name', list(COMMANDS))
-def test_every_command_has_help(name, capsys):
-    assert main([name, '--help']) == 0
-    printed = capsys.readouterr().out
-    assert f'Usage: sonar-imm {name}' in printed
-    if name != 'convert':
-        assert f'Example:\n    sonar-imm {name}' in printed
-
-
-@pytest.mark.parametrize('kind', ['fixes', 'arrivals', 'truth', 'xtf'])
-def test_every_kind_of_conversion_has_help(kind, capsys):
-    assert main(['convert', kind, '--help']) == 0
-    assert f'Example:\n    sonar-imm convert {kind}' in capsys.readouterr().out
-
-
-def test_version(capsys):
+    for arguments in ([], ['--help'], ['-h']):
+        assert main(arguments) == 0
+        printed = capsys.readouterr().out
+        assert all(f'  {name} ' in printed for name in COMMANDS)
+        lines = printed.splitlines()
+        assert len(lines) < 24 and max(map(len, lines)) <= 80  # the prompt takes one line
+        assert '--version' in lines[0]
     assert main(['--version']) == 0
     assert __version__ in capsys.readouterr().out
 
 
-def test_help_loads_no_heavy_module():
+KINDS = ('fixes', 'arrivals', 'truth', 'xtf')
+
+
+@pytest.mark.parametrize('name', [*COMMANDS, *(f'convert {kind}' for kind in KINDS)])
+def test_every_command_and_kind_of_conversion_has_help(name, capsys):
+    assert main([*name.split(), '--help']) == 0
+    printed = capsys.readouterr().out
+    assert f'Usage: sonar-imm {name}' in printed
+    if name != 'convert':
+        assert f'Example:\n    sonar-imm {name}' in printed
+        return
+    assert main(['convert']) == 0  # lists what it reads
+    printed = capsys.readouterr()
+    assert not printed.err and all(f'\n  {kind} ' in printed.out for kind in ('fixes', 'segy'))
+
+
+def test_help_is_fast_and_loads_no_heavy_module():
+    """In seconds of work, however busy the machine is."""
+    resource = pytest.importorskip('resource')
     code = (
         "import sys; from sonar_imm_tools.cli import main; main(['--help']); "
         "print([name for name in ('numpy', 'scipy', 'rosbags', 'numba', 'plotly', 'rclpy', "
         "'rich') if name in sys.modules])"
     )
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run([sys.executable, '-c', code], text=True, capture_output=True, cwd=ROOT)
-    assert done.stdout.splitlines()[-1] == '[]'
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert done.returncode == 0 and done.stdout.splitlines()[-1] == '[]'
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 2.0
 
 
-@pytest.mark.parametrize(
-    'arguments, words',
-    [
+def test_mistakes_end_in_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch):
+    for arguments, words in (
         (['trakc'], "there is no command 'trakc' (did you mean 'track'?)"),
         (['--bad'], '--bad'),
         (['track'], "Missing argument 'BAG...'"),
@@ -84,119 +83,85 @@ def test_help_loads_no_heavy_module():
         (['track', 'b', 'o', '--system', 'divers'], "'divers'"),
         (['simulate', 'diver'], "Missing argument 'OUT_BAG'"),
         (['simulate', 'diver', 'b', '--scenario', 'tabel1'], "did you mean 'table1'?"),
-        (
-            ['simulate', 'diver', 'b', '--set', 'speed=fast'],
-            "'speed' must be a number, got 'fast'",
-        ),
+        (['simulate', 'diver', 'b', '--set', 'speed=fast'], "'speed' must be a number, got 'f"),
         (['convert', 'fixes', 'nowhere.csv', 'b'], 'nowhere.csv'),
         (['convert', 'fixes', 'a', 'b', '--origin', '5'], "'5' is not of the form LAT,LON"),
         (['convert', 'fixes', 'a', 'b', '--time-offset', 'x'], 'not a number of seconds'),
         (['convert', 'arrivals', 'a', 'b'], "Missing option '--receivers'"),
+        (['convert', 'nothing.csv', 'out'], 'nothing.csv does not exist'),
+        (['convert', 'fixess', 'out'], "Did you mean 'fixes'"),
+        (['convert', str(ROOT / 'bags' / 'diver_table1'), 'out'], 'is a recording already'),
         (['check', 'dvier'], "'dvier'"),
-    ],
-)
-def test_mistakes_end_in_one_line_and_exit_code_2(arguments, words, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    printed = capsys.readouterr()
-    assert printed.out == ''
-    assert len(printed.err.splitlines()) == 1 and printed.err.startswith('sonar-imm: ')
-    assert words in printed.err
+        (['view'], "Missing argument 'RESULTS|BAG'"),
+        (['view', 'nowhere.bag'], 'nowhere.bag'),
+    ):
+        monkeypatch.chdir(tmp_path)
+        assert main(arguments) == 2
+        printed = capsys.readouterr()
+        assert printed.out == ''
+        assert len(printed.err.splitlines()) == 1 and printed.err.startswith('sonar-imm: ')
+        assert words in printed.err
 
 
 @pytest.mark.parametrize(
-    'arguments',
+    'words',
     [
-        ['track', 'BAG', 'out', '--params', '/dev/zero'],
-        ['tune', 'BAG', '--params', '/dev/zero'],
+        'track BAG out --params /dev/zero',
+        'tune BAG --params /dev/zero',
         pytest.param(
-            ['play', 'BAG', '--qos-profile-overrides-path', '/dev/zero'],
+            'play BAG --qos-profile-overrides-path /dev/zero',
             marks=pytest.mark.skipif(find_spec('rclpy') is None, reason='needs rclpy'),
         ),
-        ['info', 'folder'],
+        'info folder',
     ],
 )
-def test_parameters_and_metadata_without_an_end_are_not_read_to_it(arguments, tmp_path, capsys):
-    shutil.copytree(ROOT / 'bags' / 'diver_table1', tmp_path / 'folder')
-    (tmp_path / 'folder' / 'metadata.yaml').unlink()
-    (tmp_path / 'folder' / 'metadata.yaml').symlink_to('/dev/zero')
-    places = {'BAG': ROOT / 'bags' / 'diver_table1', 'folder': tmp_path / 'folder'}
-    places['out'] = tmp_path / 'out'
-    code = main([str(places.get(word, word)) for word in arguments])
-    printed = capsys.readouterr()
-    assert code == (0 if 'folder' in arguments else 2) and 'YAML' in printed.out + printed.err
+def test_parameters_and_metadata_without_an_end_are_not_read_to_it(
+    words, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(ROOT / 'bags' / 'diver_table1', 'folder')
+    Path('folder', 'metadata.yaml').unlink()
+    Path('folder', 'metadata.yaml').symlink_to('/dev/zero')
+    code = main(words.replace('BAG', str(ROOT / 'bags' / 'diver_table1')).split())
+    printed = ''.join(capsys.readouterr())
+    assert code == (0 if 'folder' in words else 2) and 'YAML' in printed
 
 
-def test_convert_alone_lists_what_it_reads(capsys):
-    assert main(['convert']) == 0
-    printed = capsys.readouterr()
-    assert not printed.err and all(f'\n  {kind} ' in printed.out for kind in ('fixes', 'segy'))
+@pytest.fixture
+def reading(monkeypatch):
+    """The code of a command whose recording raises an error."""
+
+    def fail(error):
+        def enter(self):
+            raise error
+
+        monkeypatch.setattr('sonar_imm_tools.recordings.reader.BagReader.__enter__', enter)
+        return main(['info', 'x.bag'])
+
+    return fail
 
 
-def test_a_bug_is_not_hidden(monkeypatch):
-    from sonar_imm_tools.cli import info
-
-    def broken(*arguments, **options):
-        raise RuntimeError('a bug')
-
-    monkeypatch.setattr(info, 'progress', broken)
-    monkeypatch.setattr(
-        'sonar_imm_tools.recordings.reader.BagReader.__enter__',
-        lambda self: (_ for _ in ()).throw(RuntimeError('a bug')),
-    )
+def test_what_is_missing_what_a_library_cannot_take_ctrl_c_and_a_bug(reading, capsys):
+    for error, code, said in (
+        (ModuleNotFoundError("No module named 'rclpy'", name='rclpy'), 2, 'sonar_imm[ros]'),
+        (UnicodeEncodeError('utf-8', 'dive\udcff', 4, 5, 'x'), 2, r'dive\udcff is not UTF-8'),
+        (KeyboardInterrupt(), 130, ''),
+    ):
+        assert reading(error) == code
+        errors = capsys.readouterr().err
+        assert said in errors and 'Traceback' not in errors
     with pytest.raises(RuntimeError, match='a bug'):
-        main(['info', 'x.bag'])
-
-
-def test_a_package_that_is_not_there_is_named(monkeypatch, capsys):
-    def absent(self):
-        raise ModuleNotFoundError("No module named 'rclpy'", name='rclpy')
-
-    monkeypatch.setattr('sonar_imm_tools.recordings.reader.BagReader.__enter__', absent)
-    assert main(['info', 'x.bag']) == 2
-    assert 'sonar_imm[ros]' in capsys.readouterr().err
-
-
-def test_a_name_that_a_library_cannot_take_is_told(monkeypatch, capsys):
-    def encoded(self):
-        'dive\udcff'.encode()
-
-    monkeypatch.setattr('sonar_imm_tools.recordings.reader.BagReader.__enter__', encoded)
-    assert main(['info', 'x.bag']) == 2
-    assert r'dive\udcff is not UTF-8' in capsys.readouterr().err
-
-
-def test_ctrl_c_is_clean(monkeypatch, capsys):
-    def interrupted(self):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr('sonar_imm_tools.recordings.reader.BagReader.__enter__', interrupted)
-    assert main(['info', 'x.bag']) == 130
-    assert 'Traceback' not in capsys.readouterr().err
+        reading(RuntimeError('a bug'))
 
 
 @pytest.mark.skipif(sys.platform == 'win32', reason='pipes end otherwise there')
 def test_a_reader_that_goes_away_is_no_trouble():
-    process = subprocess.Popen(
+    with subprocess.Popen(
         [sys.executable, '-m', 'sonar_imm_tools.cli', 'simulate', 'diver', '--list'],
-        env=dict(os.environ, PYTHONPATH=str(ROOT)),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
-    process.stdout.close()
-    assert process.wait(600) == 141
-    assert b'Traceback' not in process.stderr.read()
-    process.stderr.close()
-
-
-def test_help_is_fast():
-    """In seconds of work, however busy the machine is."""
-    resource = pytest.importorskip('resource')
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    command = [sys.executable, '-m', 'sonar_imm_tools.cli', '--help']
-    assert subprocess.run(command, capture_output=True, cwd=ROOT).returncode == 0
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 2.0
+        env=dict(os.environ, PYTHONPATH=str(ROOT)), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        process.stdout.close()
+        assert process.wait(600) == 141 and b'Traceback' not in process.stderr.read()
 
 
 ENDED = """
@@ -229,15 +194,13 @@ def test_what_a_signal_leaves_half_made_is_no_traceback():
 
 
 def test_parameters_of_the_detector_come_from_a_file_the_command_or_both(tmp_path):
-    from sonar_imm_tools.cli.common import load_detector
-
     path = tmp_path / 'parameters.yaml'
     path.write_text('fls_detector:\n  ros__parameters:\n    min_range: 15.0\n')
-    obstacle, diver = SYSTEMS['obstacle'], SYSTEMS['diver']
     asked = {'max_detections': '7', 'history': '1.0'}  # the second is no parameter of it
-    assert load_detector(obstacle, None, {}) == {}
-    assert load_detector(obstacle, path, {}) == {'min_range': 15.0}
-    assert load_detector(obstacle, None, asked) == {'max_detections': 7}
-    both = load_detector(obstacle, path, {**asked, 'min_range': '16'})
-    assert both == {'max_detections': 7, 'min_range': 16.0}
-    assert load_detector(diver, path, asked) == {}
+    both = {'max_detections': 7, 'min_range': 16.0}
+    for system, file, given, found in (
+        ('obstacle', None, {}, {}), ('obstacle', path, {}, {'min_range': 15.0}),
+        ('obstacle', None, asked, {'max_detections': 7}),
+        ('obstacle', path, {**asked, 'min_range': '16'}, both), ('diver', path, asked, {}),
+    ):  # fmt: skip
+        assert load_detector(SYSTEMS[system], file, given) == found

@@ -55,7 +55,7 @@ def bounded_shuffles(draw):
     return window, [(stamp, bytes([key])) for stamp, key, _, _ in sent]
 
 
-@given(bounded_shuffles(), st.sampled_from([None, 4, 5, 9]))
+@given(bounded_shuffles(), st.sampled_from([None, 4, 9]))
 def test_shuffled_inside_the_window_equals_sorted(case, state_limit):
     window, arrivals = case
     final, verdicts = run(ReplayHistory(b'', window, state_limit=state_limit), arrivals)
@@ -88,14 +88,6 @@ def test_any_order_equals_the_accepted_items_sorted(arrivals, window):
     assert history.state == (sorted_truth(used)[history.newest_ns] if used else b'')
 
 
-def test_revised_states_come_oldest_first_and_end_with_the_newest():
-    history = ReplayHistory(b'', 10)
-    run(history, [(1, b'a'), (5, b'b'), (9, b'c')])
-    revised = history.insert(3, b'd', b'd', chain).revised
-    assert [stamp for stamp, _ in revised] == [3, 5, 9]
-    assert revised[-1] == (9, history.state)
-
-
 def test_an_item_exactly_at_the_edge_of_the_window_is_used_with_the_right_base():
     arrivals = [(0, b'a'), (4, b'b'), (14, b'c')]
     history = ReplayHistory(b'', 10)
@@ -103,7 +95,10 @@ def test_an_item_exactly_at_the_edge_of_the_window_is_used_with_the_right_base()
     assert history.insert(3, b'late', b'late', chain).verdict == 'too_late'
     edge = history.insert(4, b'edge', b'edge', chain)
     assert edge.verdict == 'used'
-    assert dict(edge.revised)[14] == sorted_truth([*arrivals, (4, b'edge')])[14]
+    # Revised states come oldest first and end with the newest.
+    assert [stamp for stamp, _ in edge.revised] == [4, 14]
+    assert edge.revised[-1] == (14, history.state)
+    assert history.state == sorted_truth([*arrivals, (4, b'edge')])[14]
 
 
 def test_a_clock_that_stands_still_cannot_eat_the_memory():
@@ -164,18 +159,15 @@ def test_stamps_that_are_off_restart_nothing(arrivals, verdicts, abandoned):
     assert sum(d.abandoned for d in decisions) == abandoned
 
 
-@pytest.mark.parametrize('restarted', [(5, 6, 7), (5_000_000, 5_000_001, 5_000_002), (5, 7, 6)])
+@pytest.mark.parametrize('restarted', [(5_000_000, 5_000_001, 5_000_002), (5, 7, 6)])
 def test_a_restarted_clock_hands_everything_out_again(restarted):
     decisions = decide(gate(), 1000, 1001, *restarted, restarted[-1] + 1)
     assert [d.verdict for d in decisions[-2:]] == ['restart', 'use']
     assert decisions[-2].released == restarted
     assert decisions[-2].reinstated == sum(d.verdict == 'too_late' for d in decisions)
-
-
-def test_an_outlying_first_stamp_costs_nothing():
-    decisions = decide(gate(), 9_000_000, 1000, 1001, 1002)
-    assert decisions[-1].verdict == 'restart'
-    assert decisions[-1].released == (1000, 1001, 1002)
+    # An outlying first stamp costs nothing.
+    last = decide(gate(), 9_000_000, 1000, 1001, 1002)[-1]
+    assert (last.verdict, last.released) == ('restart', (1000, 1001, 1002))
 
 
 def restarts(decisions):
@@ -186,11 +178,10 @@ def released(decisions):
     return [item for d in decisions for item in d.released]
 
 
-@pytest.mark.parametrize('restart_after, window', [(3, 0), (5, 0), (5, 10), (3, 60)])
-@pytest.mark.parametrize('lateness', [3.0, 10.0, 30.0, 90.0])
+@pytest.mark.parametrize('restart_after, window', [(3, 0), (5, 10)])
+@pytest.mark.parametrize('lateness', [3.0, 30.0, 90.0])
 def test_random_lateness_is_no_restart(restart_after, window, lateness):
-    random = np.random.default_rng(1)
-    sent = np.arange(1000, 21_000)
+    random, sent = np.random.default_rng(1), np.arange(1000, 11_000)
     late = random.uniform(size=len(sent)) < 0.1
     arrived = sent[np.argsort(sent + late * lateness * random.uniform(size=len(sent)))]
     decisions = decide(StampGate(window * S, 600 * S, restart_after), *arrived)
@@ -208,7 +199,7 @@ def recording(length, seed=None):
     return stamps[random.uniform(size=length) > 0.1]
 
 
-@pytest.mark.parametrize('length', [30, 90, 1000])
+@pytest.mark.parametrize('length', [30, 1000])
 @pytest.mark.parametrize('lossy', [False, True])
 def test_a_looped_recording_restarts_each_time_and_loses_nothing(length, lossy):
     arrivals = np.concatenate([recording(length, seed if lossy else None) for seed in range(4)])
@@ -225,44 +216,34 @@ LATE = [*range(1000, 1050)]
 
 def inside(rate):
     """A clock that is set back by 250 s, told `rate` times a second."""
-    return [1000 + i / rate for i in range(500 * rate)] + [
-        1250 + i / rate for i in range(200 * rate)
-    ]
+    return [s + i / rate for s, n in ((1000, 500), (1250, 200)) for i in range(n * rate)]
 
 
-@pytest.mark.parametrize(
-    'rules, arrivals, due, at',
-    [
-        *(  # a burst of late messages
-            ((window, 600, after), [*HUNDRED, *range(165, 170), *NEXT], [*HUNDRED, *NEXT], [])
-            for window in (0, 5, 10)
-            for after in (3, 5)
-        ),
-        # what an outage held back
-        ((10, 100, 5), OUTAGE, [*HUNDRED, 260, *range(250, 260), *range(261, 300)], []),
-        # a clock set back a little reaches its old time
-        ((10, 600, 5), THOUSAND + [*range(1970, 2100)], THOUSAND + [*range(1989, 2100)], []),
-        *(  # one set back beyond any lateness is believed at once
-            ((10, 600, 5), BEYOND + [5 * 10**9 - back + i for i in range(10)], None, [54])
-            for back in (350, 3600, 10**9)
-        ),
-        # one set back inside the stream, after a long run
-        *(((10, 600, 5), inside(r), None, [500 * r + n - 1]) for r, n in ((1, 100), (10, 102))),
-        ((10, 600, 5), inside(100), None, [50_999]),
-        # an outlying first stamp inside the gap is outvoted
-        *(((5, 600, 5), [1000 + ahead, *LATE], None, [5]) for ahead in (20, 100, 299)),
-        # a stray stamp puts off a restart: the run begins again after it
-        ((5, 600, 5), [1500, *LATE[:20]], None, [5]),
-        ((5, 600, 5), [1500, *LATE[:3], 3, *LATE[3:20]], ..., [9]),
-    ],
-)
-def test_what_is_late_what_is_a_restart_and_what_comes_of_it(rules, arrivals, due, at):
-    """due: what is released, None where that is everything."""
-    window, gap, after = rules
+def restarts_at(after, arrivals, at, due=None, window=10, gap=600):
+    """The restarts are at `at`, and `due` is released; None: everything."""
     decisions = decide(StampGate(window * S, gap * S, after), *arrivals)
-    assert restarts(decisions) == at
-    if due is not ...:
-        assert released(decisions) == list(due or arrivals)
+    assert restarts(decisions) == at and released(decisions) == list(due or arrivals)
+    return True
+
+
+def test_what_is_late_what_is_a_restart_and_what_comes_of_it():
+    for window, after in ((0, 3), (10, 5)):  # a burst of late messages
+        burst = [*HUNDRED, *range(165, 170), *NEXT]
+        assert restarts_at(after, burst, [], [*HUNDRED, *NEXT], window)
+    # What an outage held back; a clock set back a little reaches its old time.
+    assert restarts_at(5, OUTAGE, [], [*HUNDRED, 260, *range(250, 260), *range(261, 300)], gap=100)
+    back = [*range(1970, 2100)]
+    assert restarts_at(5, THOUSAND + back, [], THOUSAND + [*range(1989, 2100)])
+    for back in (350, 3600, 10**9):  # one set back beyond any lateness is believed at once
+        assert restarts_at(5, BEYOND + [5 * 10**9 - back + i for i in range(10)], [54])
+    for rate, n in ((1, 100), (10, 102)):  # one set back inside the stream, after a long run
+        assert restarts_at(5, inside(rate), [500 * rate + n - 1])
+    for ahead in (20, 100, 299):  # an outlying first stamp inside the gap is outvoted
+        assert restarts_at(5, [1000 + ahead, *LATE], [5], window=5)
+    # A stray stamp puts off a restart: the run begins again after it.
+    assert restarts_at(5, [1500, *LATE[:20]], [5], window=5)
+    decisions = decide(StampGate(5 * S, 600 * S, 5), 1500, *LATE[:3], 3, *LATE[3:20])
+    assert restarts(decisions) == [9]
 
 
 def test_what_is_held_is_bounded():
@@ -290,26 +271,16 @@ def clocks(draw):
 )
 def test_every_item_has_exactly_one_fate(stamps, window, gap, hold):
     stamp_gate = StampGate(window, gap, 3, max_late_ns=100, hold=hold)
-    released = too_late = abandoned = 0
-    for stamp in stamps:
-        decision = stamp_gate.decide(stamp, stamp)
-        released += len(decision.released)
-        too_late += (decision.verdict == 'too_late') - decision.reinstated
-        abandoned += decision.abandoned
-    assert released + too_late + abandoned + stamp_gate.holding == len(stamps)
-    assert min(released, too_late, abandoned) >= 0
+    decisions = [stamp_gate.decide(stamp, stamp) for stamp in stamps]
+    too_late = sum((d.verdict == 'too_late') - d.reinstated for d in decisions)
+    abandoned = sum(d.abandoned for d in decisions)
+    fates = len(released(decisions)), too_late, abandoned, stamp_gate.holding
+    assert sum(fates) == len(stamps) and min(fates) >= 0
 
 
-@pytest.mark.parametrize(
-    'kind, arguments, problem',
-    [
-        *(
-            (ReplayHistory, {'initial': b'', 'window_ns': 0, **change}, 'a history needs')
-            for change in ({'window_ns': -1}, {'scan_limit': 0}, {'state_limit': 3})
-        ),
-        (StampGate, {'window_ns': 0, 'max_gap_ns': 1, 'restart_after': 0}, 'restart_after'),
-    ],
-)
-def test_nonsense_is_refused(kind, arguments, problem):
-    with pytest.raises(ValueError, match=problem):
-        kind(**arguments)
+def test_nonsense_is_refused():
+    for change in ({'window_ns': -1}, {'scan_limit': 0}, {'state_limit': 3}):
+        with pytest.raises(ValueError, match='a history needs'):
+            ReplayHistory(**{'initial': b'', 'window_ns': 0, **change})
+    with pytest.raises(ValueError, match='restart_after'):
+        StampGate(window_ns=0, max_gap_ns=1, restart_after=0)

@@ -10,6 +10,7 @@
 
 import itertools
 import math
+from types import SimpleNamespace
 
 from helpers.sea_vectors import vectors as sea_vectors
 from helpers.vector_files import load_vectors
@@ -47,6 +48,12 @@ def test_ten_small_steps_are_one_large_step():
     np.testing.assert_allclose(ten, ASYMMETRIC, atol=1e-13)
     np.testing.assert_allclose(chain.transition(2.0), ASYMMETRIC @ ASYMMETRIC, atol=1e-13)
     np.testing.assert_allclose(chain.transition(0.0), np.eye(3), atol=1e-15)
+    # One that forgets at once keeps its matrix.
+    rows = np.tile([0.7, 0.2, 0.1], (3, 1))
+    np.testing.assert_allclose(markov.RateChain(rows, 1.0).transition(1.0), rows, atol=1e-6)
+    for dt, why in ((-0.1, 'negative'), (np.inf, 'finite')):
+        with pytest.raises(ValueError, match=why):
+            chain.transition(dt)
 
 
 @settings(deadline=None, max_examples=60)
@@ -60,12 +67,7 @@ def test_every_step_of_every_chain_is_a_transition_matrix(models, seed, dt):
     assert markov.RateChain([[0.1, 0.9], [0.9, 0.1]], step=1.0).residual > 0.1
 
 
-def test_a_chain_that_forgets_at_once_keeps_its_matrix():
-    rows = np.tile([0.7, 0.2, 0.1], (3, 1))
-    np.testing.assert_allclose(markov.RateChain(rows, 1.0).transition(1.0), rows, atol=1e-6)
-
-
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=60)
 @given(st.integers(2, 17), st.integers(0, 2**32 - 1), st.floats(-9.0, 2.0))
 def test_every_step_is_the_matrix_exponential(models, seed, exponent):
     rng = np.random.default_rng(seed)
@@ -77,7 +79,7 @@ def test_every_step_is_the_matrix_exponential(models, seed, exponent):
     np.testing.assert_allclose(P.sum(axis=1), 1.0, rtol=1e-15)
 
 
-@pytest.mark.parametrize('dt', [1e-6, 0.1, 0.7, 3.0, 40.0])
+@pytest.mark.parametrize('dt', [1e-6, 0.7, 40.0])
 def test_a_defective_generator(dt):
     """Stages of one rate have one eigenvector; how many are passed is a Poisson number. (scipy's
     `expm` of the nearly triangular matrix is off by .03 at dt = 3: it is asked about G itself.)"""
@@ -94,25 +96,17 @@ def test_a_defective_generator(dt):
         np.testing.assert_allclose(P[i, i:-1], poisson.pmf(passed, rate * dt), atol=1e-12)
 
 
-@pytest.mark.parametrize('dt', [1e-9, 1e-3, 1.5, 1e3, 1e9])
+@pytest.mark.parametrize('dt', [1e-9, 1.5, 1e9])
 def test_slow_and_fast_rates_keep_their_digits(dt):
     """Two models in closed form; the slow way keeps its relative error beside one 1e8 faster."""
     slow, fast = 1e-8, 1.0
     total = slow + fast
     left = slow / total * -np.expm1(-total)
-    chain = markov.RateChain(
-        [[1.0 - left, left], [left * fast / slow, 1.0 - left * fast / slow]], 1.0
-    )
+    back = left * fast / slow
+    chain = markov.RateChain([[1.0 - left, left], [back, 1.0 - back]], 1.0)
     a, b = chain.generator[0, 1], chain.generator[1, 0]
     want = a / (a + b) * -np.expm1(-(a + b) * dt)
     np.testing.assert_allclose(chain.transition(dt)[0, 1], want, rtol=1e-12)
-
-
-def test_a_step_back_in_time_is_refused():
-    with pytest.raises(ValueError, match='negative'):
-        markov.RateChain(ASYMMETRIC, 1.0).transition(-0.1)
-    with pytest.raises(ValueError, match='finite'):
-        markov.RateChain(ASYMMETRIC, 1.0).transition(np.inf)
 
 
 def test_persistent_headings_match_the_reference():
@@ -127,36 +121,6 @@ def test_persistent_headings_match_the_reference():
 PRIOR = np.array([[0.8, 0.15, 0.05], [0.3, 0.5, 0.2], [0.1, 0.2, 0.7]])
 
 
-class Constant:
-    """A chain with the same matrix at every step."""
-
-    step = 1.0
-
-    def __init__(self, matrix):
-        self.matrix = matrix
-
-    def transition(self, dt):
-        return self.matrix
-
-
-def simplex(rng, *shape):
-    return rng.dirichlet(np.ones(3), size=shape)
-
-
-def test_counts_at_a_constant_step_are_the_dirichlet_posterior_mean():
-    rng = np.random.default_rng(1)
-    chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), weight=3.0)
-    learnt, counts, P = chain.initial_counts(1), np.zeros((3, 3)), PRIOR
-    for _ in range(20):
-        before, after = simplex(rng, 1), simplex(rng, 1)
-        joint = P * before[0][:, None]
-        counts += joint / joint.sum(axis=0) * after[0]
-        learnt = chain.learn(learnt, P[None], before, after, 1.0)
-        P = counts + 3.0 * PRIOR
-        P /= P.sum(axis=1, keepdims=True)
-        np.testing.assert_allclose(chain.transition(learnt, 1.0)[0], P, atol=1e-13)
-
-
 def test_counting_a_chain_that_is_seen_recovers_it_at_any_step():
     """Known models and irregular steps, none of them the reference step."""
     rng = np.random.default_rng(2)
@@ -165,9 +129,8 @@ def test_counting_a_chain_that_is_seen_recovers_it_at_any_step():
     learnt, model = chain.initial_counts(1), 0
     for dt in rng.uniform(0.4, 0.9, 8_000):
         after = rng.choice(3, p=truth.transition(dt)[model])
-        learnt = chain.learn(
-            learnt, chain.transition(learnt, dt), np.eye(3)[[model]], np.eye(3)[[after]], dt
-        )
+        seen = np.eye(3)[[model]], np.eye(3)[[after]]
+        learnt = chain.learn(learnt, chain.transition(learnt, dt), *seen, dt)
         model = after
     learnt_matrix = chain.transition(learnt, 0.65)[0]
     assert np.abs(learnt_matrix - truth.transition(0.65)).max() < 0.03
@@ -175,7 +138,7 @@ def test_counting_a_chain_that_is_seen_recovers_it_at_any_step():
 
 
 @pytest.mark.parametrize('shared', [False, True])
-@pytest.mark.parametrize('M, families', [(3, 1), (8, 1), (17, 1), (6, 3), (17, 4)])
+@pytest.mark.parametrize('M, families', [(3, 1), (6, 3), (17, 4)])
 def test_what_is_learnt_is_what_the_plain_forms_say(M, families, shared):
     """Of the transitions inside of families; the others stay, and the sums over families."""
     rng = np.random.default_rng(M)
@@ -183,7 +146,8 @@ def test_what_is_learnt_is_what_the_plain_forms_say(M, families, shared):
     nominal[0, 1] = 0.0
     nominal /= nominal.sum(axis=1, keepdims=True)
     family = np.arange(M) % families
-    chain = AdaptiveChain(Constant(nominal), weight=2.0, family=family)
+    constant = SimpleNamespace(matrix=nominal, step=1.0, transition=lambda dt: nominal)
+    chain = AdaptiveChain(constant, weight=2.0, family=family)
     inside = family[:, None] == family[None]
     learnt = chain.initial_counts(5)
     learnt += rng.uniform(0.0, 3.0, learnt.shape) * (nominal[inside] > 0.0)
@@ -209,12 +173,8 @@ def test_what_is_learnt_is_what_the_plain_forms_say(M, families, shared):
     np.testing.assert_array_equal(found[[1, 2, 4]], learnt[[1, 2, 4]])
 
 
-@pytest.fixture(scope='module')
-def floor():
-    return load_vectors('fathometer_in_the_field/floor')
-
-
-def test_onsets_of_the_vectors(floor):
+def test_onsets_of_the_vectors():
+    floor = load_vectors('fathometer_in_the_field/floor')
     trace, step = floor['trace'], float(floor['step'])
     pulse, noise = float(floor['pulse']), floor['water_profile']
     chain = OnsetChain(step, trace.shape[1], pulse, transmit_samples(trace))
@@ -268,7 +228,7 @@ def onsets_of_all_paths(chain, quiet, loud, onset, prior_onset, prior_ring):
 
 
 @pytest.mark.parametrize('ring', [2, -1])
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_sums_are_those_of_all_paths(seed, ring):
     rng = np.random.default_rng(seed)
     chain = OnsetChain(0.3, 9, 0.3, ring, fish_rate=0.2)
@@ -295,12 +255,6 @@ def test_probabilities_stay_sums_of_one_through_silence_and_nothing():
     assert state.onset.max() < 0.2
 
 
-def test_the_steps_of_the_vectors():
-    v = sea_vectors('gauss_markov')
-    for dt, a, q in zip(v['dt'], v['out_a'], v['out_q']):
-        assert gauss_markov(float(v['std']), float(v['time']), dt) == pytest.approx((a, q), 1e-9)
-
-
 def test_steps_compose_and_keep_the_variance():
     whole, part = gauss_markov(2.0, 60.0, 10.0), gauss_markov(2.0, 60.0, 1.0)
     variance, fade = 0.0, 1.0
@@ -308,3 +262,6 @@ def test_steps_compose_and_keep_the_variance():
         variance, fade = part[0] ** 2 * variance + part[1], fade * part[0]
     assert (fade, variance) == pytest.approx(whole)
     assert part[0] ** 2 * 4.0 + part[1] == pytest.approx(4.0)
+    v = sea_vectors('gauss_markov')
+    for dt, a, q in zip(v['dt'], v['out_a'], v['out_q']):
+        assert gauss_markov(float(v['std']), float(v['time']), dt) == pytest.approx((a, q), 1e-9)

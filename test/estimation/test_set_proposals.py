@@ -13,9 +13,8 @@ from itertools import combinations, product
 import math
 
 from attrs import evolve
-from helpers.set_cycle import cycle
+from helpers.set_cycle import cycle, steps, weigh
 import numpy as np
-from oracles.set_particles import weigh
 import pytest
 
 from sonar_imm.estimation import set_proposals
@@ -44,9 +43,8 @@ def record(places, sigmas, n=N, seed=None):
     """Echoes in the n cells of a record; with the noise of `seed`, as wide as the echoes."""
     b = np.sinc((np.arange(n)[:, None] - places) / 5.0) @ sigmas
     if seed is not None:
-        noise = np.fft.irfft(
-            np.fft.rfft(np.random.default_rng(seed).standard_normal(n))[: n // 10], n
-        )
+        white = np.random.default_rng(seed).standard_normal(n)
+        noise = np.fft.irfft(np.fft.rfft(white)[: n // 10], n)
         b += noise / noise.std()
     return b
 
@@ -86,19 +84,12 @@ def test_nothing_stands_out_of_noise_and_blind_proposals_see_nothing():
     assert np.diff(births.running) == pytest.approx(1.0 / N)
 
 
-@pytest.mark.parametrize('seed', range(2))
-def test_the_first_record_leaves_many_sets(seed):
+def test_the_first_record_leaves_many_sets():
     """Of sets that are drawn one member after the other it leaves one, with what is in it."""
-    tracker, right = SetFilter(MODEL, 4000), 0.0
-    step, effective = None, []
-    for k in range(4):
-        step = cycle(
-            tracker, step and step.after, record(PLACES, SIGMAS, seed=9 * seed + k), (seed, k)
-        )
-        effective.append(step.effective)
-        right = tracker.summarise(step).pmf[7]
-    assert effective[0] > 20.0 and min(effective[1:]) > 80.0
-    assert right > 0.5
+    tracker = SetFilter(MODEL, 4000)
+    found = list(steps(tracker, [record(PLACES, SIGMAS, seed=k) for k in range(4)], 0))
+    assert found[0].effective > 20.0 and min(step.effective for step in found[1:]) > 80.0
+    assert tracker.summarise(found[-1]).pmf[7] > 0.5
 
 
 def test_independent_members_pay_for_their_places_alone():
@@ -112,10 +103,9 @@ def test_independent_members_pay_for_their_places_alone():
         evolve(MODEL, start=independent_orders(1, 11))
 
 
-@pytest.mark.parametrize('start', [np.full(3, 1 / 3), independent_orders(0, 3)])
-def test_before_the_first_record_members_neither_come_nor_go(start):
+def test_before_the_first_record_members_neither_come_nor_go():
     """The orders of a first record by the sum over all sets and all that they walk."""
-    n, walk = 10, np.array([0.25, 0.5, 0.25])
+    n, walk, start = 10, np.array([0.25, 0.5, 0.25]), independent_orders(0, 3)
     model = SetModel(
         cells=n, separation=2, order_min=0, transition=banded_transition(3, 0.2), walk=walk,
         gram=np.exp(-0.5 * np.arange(n) ** 2.0), amplitude_std=3.0, start=start,
@@ -125,14 +115,14 @@ def test_before_the_first_record_members_neither_come_nor_go(start):
     exact = np.zeros(3)
     for m in range(3):
         for places in combinations(range(n), m):
-            for steps in product((-1, 0, 1), repeat=m):
-                z = np.sort(np.array(places, int) + np.array(steps, int))
+            for moves in product((-1, 0, 1), repeat=m):
+                z = np.sort(np.array(places, int) + np.array(moves, int))
                 apart = np.append(np.diff(places), np.diff(z)).min(initial=2)
                 if apart < 2 or z.min(initial=0) < 0 or z.max(initial=0) >= n:
                     continue
                 sets = Sets.empty(model, 1)
                 sets.order[:], sets.cell[0, :m] = m, z
-                chance = np.prod(walk[np.array(steps, int) + 1]) / model.room(m)
+                chance = np.prod(walk[np.array(moves, int) + 1]) / model.room(m)
                 exact[m] += start[m] * chance * np.exp(weigh(model, b, sets)[0][0])
     tracker = SetFilter(model, 100_000)
     record = tracker.record(b, (3, 1), records=0)
@@ -140,8 +130,7 @@ def test_before_the_first_record_members_neither_come_nor_go(start):
     assert tracker.summarise(step).pmf == pytest.approx(exact / exact.sum(), abs=0.01)
 
 
-@pytest.mark.parametrize('wide', [False, True])
-@pytest.mark.parametrize('all_sums', [False, True])
+@pytest.mark.parametrize('wide, all_sums', [(False, True), (True, False)])
 def test_walks_are_drawn_by_what_they_come_to(wide, all_sums):
     """Walks of two kinds, one with a gap and aside; also beside a peak that is out of reach."""
     n, share, rng = 30, 0.8, np.random.default_rng(2)
@@ -172,22 +161,6 @@ def test_walks_are_drawn_by_what_they_come_to(wide, all_sums):
             assert tables.running[row] == pytest.approx(np.cumsum(q), rel=1e-12)
             ratio = np.divide(K, q, out=np.zeros(5), where=q > 0.0)
             assert tables.ratio[row] == pytest.approx(ratio, rel=1e-12)
-
-
-@pytest.mark.parametrize('shift', [None, Shift(std=1.5, step=2)])
-def test_every_row_from_which_a_member_walks_is_known_to_be_wanted(shift):
-    its = evolve(MODEL, negative_probability=0.2, shift=shift)
-    sets = Sets.empty(its, 3)
-    sets.order[:] = 2, 1, 0
-    sets.cell[0, :2], sets.cell[1, 0], sets.sign[0, 1] = (5, 399), 30, -1
-    offsets = range(0, 2 * its.pad + 1, 2) if shift else [0]
-    expected = np.zeros((2, its.record_cells), bool)
-    for offset in offsets:
-        expected[0, [5 + offset, 30 + offset]] = expected[1, 399 + offset] = True
-    found = set_proposals.walked_from(its, sets).reshape(expected.shape)
-    assert (found >= expected).all()
-    # What is no member counts as one in the first cell.
-    assert found.sum() <= expected.sum() + len(offsets)
 
 
 # -- jumps that all members make together: against sums over all sets, jumps and walks ------------
@@ -228,10 +201,12 @@ def every_set(model):
 def transitions(model, states):
     """For each jump in cells, the probabilities (K, K) of the ways from set to set with it. Those
     that lead to no possible set are missing."""
-    places = model.jump.step * np.arange(-model.jump.reach, model.jump.reach + 1)
-    density = np.exp(-0.5 * np.square(places / model.jump.std))
-    jumps = model.jump.probability * density / density.sum()
-    jumps[model.jump.reach] += 1.0 - model.jump.probability
+    places, jumps = np.zeros(1), np.ones(1)
+    if model.jump:
+        places = model.jump.step * np.arange(-model.jump.reach, model.jump.reach + 1)
+        density = np.exp(-0.5 * np.square(places / model.jump.std))
+        jumps = model.jump.probability * density / density.sum()
+        jumps[model.jump.reach] += 1.0 - model.jump.probability
     number = {state: k for k, state in enumerate(states)}
     found = {int(d): np.zeros((len(states), len(states))) for d in places}
     radius = len(model.walk) // 2
@@ -242,9 +217,9 @@ def transitions(model, states):
         for left, (d, q) in product(combinations(state, stay), zip(found, jumps)):
             if not all(0 <= z + d < model.cells for z, _ in left):
                 continue
-            for steps in product(range(len(model.walk)), repeat=stay):
-                walked = [(z + d + w - radius, s) for (z, s), w in zip(left, steps)]
-                paid = p / math.comb(len(state), stay) * q * math.prod(model.walk[list(steps)])
+            for moves in product(range(len(model.walk)), repeat=stay):
+                walked = [(z + d + w - radius, s) for (z, s), w in zip(left, moves)]
+                paid = p / math.comb(len(state), stay) * q * math.prod(model.walk[list(moves)])
                 for born in product(births, repeat=order - stay):
                     k = number.get(tuple(sorted([*walked, *(each[:2] for each in born)])))
                     if k is not None:
@@ -254,7 +229,8 @@ def transitions(model, states):
 
 def exact(model, records):
     """pmf (T, orders), intensity (T, n), log_evidence (T,); jump (T, 2): probability that members
-    jumped, and mean jump. By sums over all sets of a small lattice."""
+    jumped, and mean jump; mean shift (T,). By sums over all sets of a small lattice, and all
+    shifts."""
     states = list(every_set(model))
     orders = np.array([len(state) - model.order_min for state in states])
     sets = Sets.empty(model, len(states))
@@ -266,29 +242,38 @@ def exact(model, records):
             sets.cell[k, j], sets.sign[k, j] = z, sign
             there[k, z] = 1.0
             p[k] *= model.signs[sign]
+    shifts, move, p = np.zeros(1), np.ones((1, 1)), p[None]
+    if model.shift:
+        shifts, move = model.shift.places, np.exp(model.shift.log_prior())
+        p = p * np.exp(model.shift.log_start())[:, None]
     ways, rows = transitions(model, states), []
     for b in records:
-        likelihood = np.exp(weigh(model, b, sets)[0])
-        by_jump = {d: (p @ way) * likelihood for d, way in ways.items()}
+        likelihood = np.empty((len(shifts), len(states)))
+        for row, shift in zip(likelihood, shifts + model.pad):
+            sets.shift[:] = shift
+            row[:] = np.exp(weigh(model, b, sets)[0])
+        by_jump = {d: move.T @ p @ way * likelihood for d, way in ways.items()}
         p = np.sum(list(by_jump.values()), axis=0)
         total = float(p.sum())
         p /= total
         mass = {d: float(each.sum()) / total for d, each in by_jump.items()}
         jump = 1.0 - mass[0], sum(d * each for d, each in mass.items())
-        pmf = np.bincount(orders, p, len(model.transition))
-        rows.append((pmf, p @ there, math.log(total), jump))
+        of_sets, shift = p.sum(axis=0), float(shifts @ p.sum(axis=1))
+        pmf = np.bincount(orders, of_sets, len(model.transition))
+        rows.append((pmf, of_sets @ there, math.log(total), jump, shift))
     return [np.array(column) for column in zip(*rows)]
 
 
 def run(model, records, particles, seed):
-    """PMFs (T, orders), intensities (T, n), log evidence (T,), probability that members jumped and
-    mean jump (T, 2)."""
-    tracker, before, found = SetFilter(model, particles), None, []
-    for name, b in enumerate(records):
-        step = cycle(tracker, before, b, (seed, name))
-        before = step.after
-        pmf, sums, _, jump = tracker.summarise(step)
-        found.append((pmf, sums[0], step.log_evidence, (jump[0], jump[0] * jump[1])))
+    """The same by particles."""
+    tracker, found = SetFilter(model, particles), []
+    for step in steps(tracker, records, seed):
+        pmf, *_, jump = tracker.summarise(step)
+        there = np.arange(step.sets.cell.shape[1]) < step.sets.order[:, None]
+        w = np.broadcast_to(step.w[:, None], there.shape)
+        intensity = np.bincount(step.sets.cell[there], w[there], model.cells)
+        jump, shift = (jump[0], jump[0] * jump[1]), step.w @ step.sets.shift - model.pad
+        found.append((pmf, intensity, step.log_evidence, jump, shift))
     return tuple(np.array(column) for column in zip(*found))
 
 
@@ -298,48 +283,44 @@ def run(model, records, particles, seed):
         {},
         {'walk_share': 0.0, 'birth_share': 0.0},
         {'jump': Jump(probability=0.4, std=1.0, step=1, reach=5), 'negative_probability': 0.0},
+        {'jump': None, 'shift': Shift(std=1.5, memory=0.6)},
+        {'jump': None, 'shift': Shift(std=2.0, step=2), 'negative_probability': 0.0},
     ],
 )
-def test_sets_that_jump_are_the_exact_ones(model, records, change):
+def test_sets_that_jump_or_share_a_shift_are_the_exact_ones(model, records, change):
     changed = evolve(model, **change)
-    pmf, intensity, log_evidence, jump = exact(changed, records)
-    found = run(changed, records, 60_000, seed=1)
+    heard = np.pad(records, [(0, 0), (changed.pad, changed.pad)])
+    pmf, intensity, log_evidence, jump, shift = exact(changed, heard)
+    found = run(changed, heard, 60_000, seed=1)
     assert 0.5 * np.abs(found[0] - pmf).sum(axis=1).max() < 0.015
-    assert np.abs(found[1] - intensity).sum(axis=1).max() < 0.06
+    assert np.abs(found[1] - intensity).sum(axis=1).max() < (0.1 if changed.shift else 0.06)
     assert found[2] == pytest.approx(log_evidence, abs=0.05)
-    assert found[3][:, 0] == pytest.approx(jump[:, 0], abs=0.02)
-    assert found[3][:, 1] == pytest.approx(jump[:, 1], abs=0.06)
+    assert (np.abs(found[3] - jump).max(axis=0) < [0.02, 0.06]).all()
+    assert found[4] == pytest.approx(shift, abs=0.1)
     if not change:
         assert jump[JUMP_AT, 0] > 0.5 > jump[[1, 2, 4, 5, 6], 0].max()
 
 
-def test_what_a_jump_is_beforehand():
-    jump = Jump(probability=0.1, std=3.0, step=2, reach=6)
-    tables, places = jump.tables(), np.arange(-12, 13, 2)
-    density = 0.1 * np.exp(-0.5 * np.square(places / 3.0))
-    density /= density.sum() / 0.1
-    assert np.exp(tables.log_prior[0]) == pytest.approx(density + 0.9 * (places == 0))
-    assert tables.prior[0] == pytest.approx(np.cumsum(density + 0.9 * (places == 0)))
-    assert jump.pad == 12
-
-
-def test_jumps_do_not_go_with_a_shift_and_have_bounds(model):
+def test_what_a_jump_is_beforehand(model):
+    jump, places = Jump(probability=0.1, std=3.0, step=2, reach=6), np.arange(-12, 13, 2)
+    density = np.exp(-0.5 * np.square(places / 3.0))
+    prior = 0.1 * density / density.sum() + 0.9 * (places == 0)
+    assert np.exp(jump.tables().log_prior[0]) == pytest.approx(prior)
+    assert jump.tables().prior[0] == pytest.approx(np.cumsum(prior)) and jump.pad == 12
     with pytest.raises(ValueError, match='shift'):
         evolve(model, shift=Shift(std=1.0))
     for change in ({'probability': 1.0}, {'std': 0.0}, {'step': 0}, {'reach': 0}, {'reach': 900}):
         with pytest.raises(ValueError, match='jump'):
-            evolve(model.jump, **change)
+            evolve(jump, **change)
 
 
 def test_what_is_smoothed_jumped_when_it_did(model, records):
-    tracker, smoother, before, found = SetFilter(model, 4000), LagSmoother(2), None, []
-    for name, b in enumerate(records):
-        step = cycle(tracker, before, b, (2, name))
-        before = step.after
+    tracker, smoother, found = SetFilter(model, 4000), LagSmoother(2), []
+    for step in steps(tracker, records, 2):
         if earlier := smoother.push(step):
-            found.append(tracker.summarise(earlier).jump[0])
-            places = tracker.summarise(earlier).sums[0]
-            assert places.sum() <= 2.0 + 1e-9
+            summary = tracker.summarise(earlier)
+            found.append(summary.jump[0])
+            assert summary.sums[0].sum() <= 2.0 + 1e-9
     # The first that comes out is record 0.
     assert int(np.argmax(found)) == JUMP_AT
 

@@ -11,7 +11,6 @@ sequence of models."""
 
 import itertools
 
-from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
@@ -89,10 +88,7 @@ def joint_by_covariance(F, Q, B, H, R, x0, P0, Z):
     return x.reshape(K, n), np.einsum('kakb->kab', after.reshape(K, n, K, n))
 
 
-# -- IMM: exact cases -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize('models, moves_at_all', [(1, True), (3, True), (3, False)])
+@pytest.mark.parametrize('models, moves_at_all', [(1, True), (3, False)])
 def test_models_that_are_all_the_same_give_the_joint_gaussian_and_the_chain(models, moves_at_all):
     """The data say nothing about the model: smoothed probabilities are those of the chain. The
     second number may be known exactly after each step: F P F' + Q is singular."""
@@ -106,21 +102,16 @@ def test_models_that_are_all_the_same_give_the_joint_gaussian_and_the_chain(mode
     moves = [transition, *(np.repeat(part[:, None], models, axis=1) for part in (F, Q, B))]
     x0, P0 = np.zeros((models, 2)), repeat(np.eye(2), models)
     smoothed = imm_smooth(*imm_pass(*moves, H, R, x0, P0, mu0, Z), *moves)
-    x, P = joint_by_covariance(F, Q, B, H, R, x0[0], P0[0], Z)
-    for part, due in zip(
-        rts_smooth(*kalman_pass(F, Q, B, H, R, x0[0], P0[0], Z), F, Q, B), (x, P)
-    ):
-        np.testing.assert_allclose(part, due, atol=1e-9)
-    expected_mu = [mu0]
+    known = F, Q, B, H, R, x0[0], P0[0], Z
+    due, mu = joint_by_covariance(*known), [mu0]
     for k in range(1, K):
-        expected_mu.append(expected_mu[-1] @ transition[k])
-    for model in range(models):
-        np.testing.assert_allclose(smoothed.x[:, model], x, atol=1e-9)
-        np.testing.assert_allclose(smoothed.P[:, model], P, atol=1e-9)
-    np.testing.assert_allclose(smoothed.mu, expected_mu, atol=1e-9)
-    mean, spread = smoothed.combine(repeat(np.eye(2), models))
-    np.testing.assert_allclose(mean, x, atol=1e-9)
-    np.testing.assert_allclose(spread, P, atol=1e-9)
+        mu.append(mu[-1] @ transition[k])
+    np.testing.assert_allclose(smoothed.mu, mu, atol=1e-9)
+    alone = rts_smooth(*kalman_pass(*known), F, Q, B)
+    each = [(smoothed.x[:, model], smoothed.P[:, model]) for model in range(models)]
+    for found in (alone, *each, smoothed.combine(repeat(np.eye(2), models))):
+        for part, right in zip(found, due):
+            np.testing.assert_allclose(part, right, atol=1e-9)
 
 
 def test_states_drawn_anew_give_the_forward_backward_algorithm():
@@ -161,19 +152,17 @@ def test_a_model_nothing_leads_to_stays_finite():
     np.testing.assert_array_equal(smoothed.mu[:, 2], 0.0)
 
 
-def test_a_forward_pass_that_contradicts_itself_is_refused():
+def test_nothing_to_smooth():
+    for K in (0, 1):
+        x, P, mu = np.ones((K, 2, 3)), repeat(repeat(np.eye(3), 2), K), np.full((K, 2), 0.5)
+        smoothed = imm_smooth(x, P, mu, np.ones((K, 2, 2)) / 2, P, P)
+        np.testing.assert_array_equal(smoothed.x, x)
+        np.testing.assert_array_equal(smoothed.mu, mu)
+    # A forward pass that contradicts itself is refused.
     x, P = np.zeros((2, 2, 1)), np.ones((2, 2, 1, 1))
     mu, transition = np.array([[1.0, 0.0], [0.0, 1.0]]), repeat(np.eye(2), 2)
     with pytest.raises(ValueError, match='no probable model leads'):
         imm_smooth(x, P, mu, transition, P, P)
-
-
-@pytest.mark.parametrize('K', [0, 1])
-def test_nothing_to_smooth(K):
-    x, P, mu = np.ones((K, 2, 3)), repeat(repeat(np.eye(3), 2), K), np.full((K, 2), 0.5)
-    smoothed = imm_smooth(x, P, mu, np.ones((K, 2, 2)) / 2, P, P)
-    np.testing.assert_array_equal(smoothed.x, x)
-    np.testing.assert_array_equal(smoothed.mu, mu)
 
 
 # -- IMM: short sequences, every sequence of models enumerated ------------------------------------
@@ -183,15 +172,14 @@ def enumerate_sequences(F, Q, B, H, R, x, P, mu, transition, Z):
     """Exact smoothed mean, covariance and model probabilities."""
     K, M = len(Z), len(mu)
     sequences = np.array(list(itertools.product(range(M), repeat=K)))
-    log_weight, x, P, xs, Ps = (
-        np.log(mu[sequences[:, 0]]), x[sequences[:, 0]], P[sequences[:, 0]], [], [],
-    )  # fmt: skip
+    log_weight, x, P = (part[sequences[:, 0]] for part in (np.log(mu), x, P))
+    xs, Ps = [], []
     for k in range(K):
         now = sequences[:, k]
         if k:
             log_weight = log_weight + np.log(transition[sequences[:, k - 1], now])
             x, P, _ = kalman.predict(x, P, F[now], Q[now], B[now])
-        updated = kalman.update(x, P, Z[k] - x @ H.T, H, R[k] if R.ndim == 3 else R)
+        updated = kalman.update(x, P, Z[k] - x @ H.T, H, R)
         x, P, log_weight = updated.x, updated.P, log_weight + updated.log_likelihood
         xs.append(x)
         Ps.append(P)
@@ -219,63 +207,41 @@ def draw(rng, F, Q, B, H, R, x0, P0, mu, transition, K):
 
 def random_models(rng, M):
     F = np.stack([[[1.0, 1.0], [0.0, rng.uniform(0, 1)]] for _ in range(M)])
-    return (
-        F, 0.1 * covariance(rng, M, 2), rng.normal(size=(M, 2)), np.array([[1.0, 0.0]]),
-        0.5 * np.eye(1),
-    )  # fmt: skip
+    Q, B = 0.1 * covariance(rng, M, 2), rng.normal(size=(M, 2))
+    return F, Q, B, np.array([[1.0, 0.0]]), 0.5 * np.eye(1)
 
 
 def headings(rng, M):
     """Fixed speed along M headings, no memory: F has rows of zeros, Q has rank two of four."""
     angle = 2 * np.pi * np.arange(M) / M
-    u = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    G = np.vstack([np.eye(2), np.eye(2)])
-    return (
-        repeat(np.diag([1.0, 1.0, 0.0, 0.0]), M), repeat(0.19**2 * G @ G.T, M), np.hstack([u, u]),
-        np.eye(2, 4), np.eye(2),
-    )  # fmt: skip
+    u, G = np.stack([np.cos(angle), np.sin(angle)], axis=1), np.vstack([np.eye(2), np.eye(2)])
+    F, Q = repeat(np.diag([1.0, 1.0, 0.0, 0.0]), M), repeat(0.19**2 * G @ G.T, M)
+    return F, Q, np.hstack([u, u]), np.eye(2, 4), np.eye(2)
 
 
 def quiet_and_agile(rng, M):
-    G = np.array([0.5, 1.0])
-    return (
-        repeat(np.array([[1.0, 1.0], [0.0, 1.0]]), M),
-        np.geomspace(0.01, 2.0, M)[:, None, None] * np.outer(G, G),
-        np.zeros((M, 2)),
-        np.array([[1.0, 0.0]]),
-        0.3 * np.eye(1),
-    )
-
-
-@pytest.mark.parametrize('case', range(3))
-def test_the_enumeration_itself_agrees_with_an_independent_one(case):
-    """At the last step smoothing is filtering, which the vectors of another prototype hold."""
-    K = 5
-    vectors = load_vectors('diver/exact_mode_tree')
-    F, Q, B, transition, mu = (vectors[f'cvct/{name}'] for name in ('F', 'Q', 'B', 'Pi', 'mu0'))
-    x0, P0, Z, R, *expected = (
-        vectors[f'cvct/{case}/{name}']
-        for name in ('x0', 'P0', 'Z', 'R', 'exact_x', 'exact_P', 'exact_mu')
-    )
-    # The vectors move before they measure: a first measurement without information stands for
-    # that.
-    Z, R = np.vstack([np.zeros((1, 2)), Z[:K]]), np.concatenate([1e14 * np.eye(2)[None], R[:K]])
-    answer = enumerate_sequences(F, Q, B, np.eye(2, 4), R, x0, P0, mu, transition, Z)
-    for got, want in zip(answer, expected):
-        np.testing.assert_allclose(got[-1], want[K - 1], rtol=1e-7, atol=1e-8)
+    G, F = np.array([0.5, 1.0]), repeat(np.array([[1.0, 1.0], [0.0, 1.0]]), M)
+    Q = np.geomspace(0.01, 2.0, M)[:, None, None] * np.outer(G, G)
+    return F, Q, np.zeros((M, 2)), np.array([[1.0, 0.0]]), 0.3 * np.eye(1)
 
 
 def enumerated(models, M, K, seed):
     """Moves of a random scene, its forward pass, and what `enumerate_sequences` says of it."""
+    rng, moves, (F, Q, B, H, R, x0, P0, mu), transition = random_scene(models, M, K, seed)
+    Z = draw(rng, F, Q, B, H, R, x0, P0, mu, transition, K)
+    exact = enumerate_sequences(F, Q, B, H, R, x0, P0, mu, transition, Z)
+    return moves, imm_pass(*moves, H, R, x0, P0, mu, Z), exact
+
+
+def random_scene(models, M, K, seed):
+    """A generator of random numbers, the moves of a scene, its parts, and the chain."""
     rng = np.random.default_rng(seed)
     F, Q, B, H, R = models(rng, M)
     n = F.shape[-1]
     mu, transition = rng.dirichlet(3 * np.ones(M)), chain(rng, M)
-    x0, P0 = np.zeros((M, n)), repeat(np.eye(n), M)
-    Z = draw(rng, F, Q, B, H, R, x0, P0, mu, transition, K)
-    exact = enumerate_sequences(F, Q, B, H, R, x0, P0, mu, transition, Z)
     moves = [repeat(part, K) for part in (transition, F, Q, B)]
-    return moves, imm_pass(*moves, H, R, x0, P0, mu, Z), exact
+    start = np.zeros((M, n)), repeat(np.eye(n), M), mu
+    return rng, moves, (F, Q, B, H, R, *start), transition
 
 
 def distances(states, exact):
@@ -291,12 +257,9 @@ def distances(states, exact):
 @pytest.mark.parametrize(
     'models, M, K, mean_errors, worst_errors',
     [
-        (random_models, 2, 9, (0.0005, 0.001, 0.001), (0.010, 0.015)),
         (random_models, 3, 5, (0.0012, 0.005, 0.003), (0.035, 0.025)),
-        (headings, 3, 5, (0.0009, 0.007, 0.006), (0.025, 0.025)),
         (headings, 4, 4, (0.0005, 0.003, 0.002), (0.010, 0.010)),
         (quiet_and_agile, 2, 9, (0.003, 0.008, 0.015), (0.05, 0.12)),
-        (quiet_and_agile, 3, 5, (0.0005, 0.001, 0.003), (0.004, 0.03)),
     ],
 )
 def test_close_to_the_enumeration_of_all_sequences(models, M, K, mean_errors, worst_errors):
@@ -312,14 +275,6 @@ def test_close_to_the_enumeration_of_all_sequences(models, M, K, mean_errors, wo
     assert (np.mean(filtered, axis=(0, 2)) > 20.0 * mean).all()
 
 
-def test_where_the_imm_filter_is_far_off_the_smoother_is_not():
-    """The filter ends 1.7 sigmas off: its Gaussians do not take the place of better ones."""
-    moves, (x, P, mu), exact = enumerated(random_models, 2, 9, 114)
-    last = imm.combine(x, P, mu, repeat(np.eye(2), 2))[0][-1] - exact[0][-1]
-    assert np.sqrt(last @ np.linalg.solve(exact[1][-1], last)) > 1.5
-    assert distances(imm_smooth(x, P, mu, *moves)[:3], exact).max() < 0.001
-
-
 def test_more_gaussians_end_at_the_exact_answer(monkeypatch):
     """With 64 per model hardly any two of the 512 sequences are merged."""
     moves, states, exact = enumerated(quiet_and_agile, 2, 9, 2)
@@ -332,12 +287,9 @@ def test_more_gaussians_end_at_the_exact_answer(monkeypatch):
 
 
 def test_the_prediction_is_that_of_an_imm_filter_unless_it_is_given():
-    rng, K, M = np.random.default_rng(6), 6, 3
-    F, Q, B, H, R = random_models(rng, M)
-    mu, transition = rng.dirichlet(3 * np.ones(M)), chain(rng, M)
-    x0, P0 = np.zeros((M, 2)), repeat(np.eye(2), M)
-    moves = [repeat(part, K) for part in (transition, F, Q, B)]
-    filtered = imm_pass(*moves, H, R, x0, P0, mu, rng.normal(size=(K, 1)))
+    K, M = 6, 3
+    rng, moves, (F, Q, B, *known), transition = random_scene(random_models, M, K, 6)
+    filtered = imm_pass(*moves, *known, rng.normal(size=(K, 1)))
     parts = [[np.zeros((M, 2))], [np.zeros((M, 2, 2))], [np.zeros(M)]]
     for x, P, mu in zip(*(part[:-1] for part in filtered)):
         mixed = imm.mix(x[None], P[None], mu[None], transition[None])
@@ -351,13 +303,10 @@ def test_the_prediction_is_that_of_an_imm_filter_unless_it_is_given():
 
 def test_after_a_step_that_no_measurement_explains_the_filtered_states_count():
     """An update that widens: it and what follows are smoothed as if the pass began there."""
-    rng, K, M = np.random.default_rng(7), 5, 3
-    F, Q, B, H, R = quiet_and_agile(rng, M)
-    mu, transition = rng.dirichlet(3 * np.ones(M)), chain(rng, M)
-    x0, P0 = np.zeros((M, 2)), repeat(np.eye(2), M)
-    moves = [repeat(part, K) for part in (transition, F, Q, B)]
+    K, M = 5, 3
+    rng, moves, (_, _, _, H, R, *start), _ = random_scene(quiet_and_agile, M, K, 7)
     Z = rng.normal(size=(K, 1))
-    before = imm_pass(*moves, H, R, x0, P0, mu, Z[:3])
+    before = imm_pass(*moves, H, R, *start, Z[:3])
     before[1][2] *= 30.0
     begin = [part[2] for part in before]
     after = imm_pass(*moves, H, R, *begin, Z[3:], moves_first=True)
@@ -386,14 +335,10 @@ def filtered(likelihood, mu):
 def test_a_hidden_markov_chain_is_smoothed_exactly():
     rng = np.random.default_rng(1)
     likelihood, mu0 = rng.random((6, 3)), np.array([0.2, 0.5, 0.3])
-    weights = np.zeros((6, 3))
-    for path in np.ndindex(*(3,) * 7):
-        weight = mu0[path[0]]
-        for k in range(6):
-            weight *= P[path[k], path[k + 1]] * likelihood[k, path[k + 1]]
-        for k in range(6):
-            weights[k, path[k + 1]] += weight
-    exact = weights / weights.sum(axis=1, keepdims=True)
+    paths = np.array(list(np.ndindex(*(3,) * 7)))
+    weight = mu0[paths[:, 0]] * P[paths[:, :-1], paths[:, 1:]].prod(axis=1)
+    weight *= likelihood[np.arange(6), paths[:, 1:]].prod(axis=1)
+    exact = np.array([np.bincount(column, weight) for column in paths[:, 1:].T]) / weight.sum()
     assert smooth_modes(filtered(likelihood, mu0), P) == pytest.approx(exact)
 
 

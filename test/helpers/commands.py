@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The command in this process, and what it leaves."""
+"""The command in this process, what it leaves, and processes that are begun."""
 
 from pathlib import Path
 
@@ -25,3 +25,8 @@ def contents(folder, *passed_over):
         for path in Path(folder).rglob('*')
         if path.is_file() and not path.is_symlink() and path.name not in passed_over
     }
+
+
+def children(pid):
+    """The processes that a process has begun."""
+    return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]

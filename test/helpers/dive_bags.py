@@ -38,12 +38,8 @@ def write_dive(path, *, count=120, seed=4, truth=True, topic='/fix', spoilt=(), 
                 bag.write(name, message, stamp)
         stamp_ns = stamps(times)
         for arrival, index in enumerate(order):
-            fix = Fix(
-                stamp_ns=stamp_ns[index],
-                position=[*place[index], 0.0],
-                frame_id='map',
-                covariance=np.eye(2) * FIX_SIGMA**2,
-            )
+            given = {'position': [*place[index], 0.0], 'covariance': np.eye(2) * FIX_SIGMA**2}
+            fix = Fix(stamp_ns=stamp_ns[index], frame_id='map', **given)
             message = write_fix(fix, ros_message)
             if index in spoilt:
                 message.pose.pose.position.x = float('nan')

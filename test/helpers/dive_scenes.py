@@ -86,8 +86,5 @@ def single_run(count=400, seed=1, spread=1.0):
         estimate_at(stamp, state[None], [7], nis=[value])
         for stamp, state, value in zip(stamps(times), truth + error, nis)
     ]
-    return (
-        estimates,
-        [truth_estimate(stamp, state[None], [0]) for stamp, state in zip(stamps(times), truth)],
-        times,
-    )
+    true = [truth_estimate(stamp, state[None], [0]) for stamp, state in zip(stamps(times), truth)]
+    return estimates, true, times

@@ -6,12 +6,14 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Helpers of the diver tests: fixes, runs, errors."""
+"""Helpers of the diver tests: fixes, pings, runs, errors."""
 
 from attrs import fields
 import numpy as np
 
 from sonar_imm.measurements import Arrivals, Fix, Fixes
+from sonar_imm.trackers.diver.instruments import Instruments
+from sonar_imm.trackers.diver.scan import ping_measurements
 
 SECOND = 10**9
 
@@ -53,6 +55,23 @@ def arrivals(stamp_ns, rx, toa, **more):
     return Arrivals(stamp_ns=stamp_ns, rx=rx, toa=toa, **known)
 
 
+def numbers_of(ping, config, models, layout=None):
+    layout = layout or Instruments().layout(config, models)
+    return ping_measurements(ping, np.arange(len(ping)), config, models, layout)
+
+
+def followed(tracker, measurements):
+    """The newest estimate after each measurement."""
+    return [tracker.process(measurement)[-1] for measurement in measurements]
+
+
+def miss(estimate, place, row=0):
+    """How far a row is from a place of two or three coordinates, m, and the NEES."""
+    n = len(place)
+    off = estimate.state[row, :n] - place
+    return np.sqrt(off @ off), off @ np.linalg.solve(estimate.covariance[row, :n, :n], off)
+
+
 def run(tracker, measurements):
     """The last word on every stamp."""
     final = {}
@@ -61,36 +80,30 @@ def run(tracker, measurements):
     return [final[stamp] for stamp in sorted(final)]
 
 
-def arrays(known):
-    """Every array of a `Known`, by name."""
-    yield from known.features.items()
-    for name, part in (('life', known.life), ('rows', known.rows), ('borrowed', known.borrowed)):
-        for field in fields(type(part)):
-            value = getattr(part, field.name)
-            if isinstance(value, np.ndarray):
-                yield f'{name}.{field.name}', value
-    yield from known.rows.key.items()
-    for number, block in enumerate(known.rows.blocks):
-        yield from ((f'{name}_{number}', part) for name, part in zip('xP', block))
-
-
 def read_only(known):
     """Let nobody write into a `Known`, and count its arrays."""
-    found = [array for _, array in arrays(known)]
+    found = [*known.features.values(), *known.rows.key.values()]
+    found += [part for block in known.rows.blocks for part in block]
+    for part in (known.life, known.rows, known.borrowed):
+        found += [getattr(part, field.name) for field in fields(type(part))]
+    found = [array for array in found if isinstance(array, np.ndarray)]
     for array in found:
         array.flags.writeable = False
     return len(found)
 
 
-def errors(estimates, track):
-    """Position error (k, 2) and covariance (k, 2, 2) of the confirmed row of each stamp."""
+def errors(estimates, track, first=0):
+    """(k, 2): `miss` of the confirmed row of each estimate, from the stamp `first` of it on."""
     at = {int(stamp): k for k, stamp in enumerate(track.stamp_ns)}
     found = []
     for estimate in estimates:
-        rows = np.flatnonzero(estimate.extras['track_state'] > 0)
-        if len(rows):
-            truth = track.position[at[estimate.stamp_ns], :2]
-            found.append(
-                (estimate.state[rows[0], :2] - truth, estimate.covariance[rows[0], :2, :2])
-            )
-    return [np.array(column) for column in zip(*found)]
+        rows, k = np.flatnonzero(estimate.extras['track_state'] > 0), at[estimate.stamp_ns]
+        if len(rows) and k >= first:
+            found.append(miss(estimate, track.position[k, :2], rows[0]))
+    return np.array(found)
+
+
+def both_sides(estimate):
+    """The two places that the rows of both sides are at."""
+    image = np.array([estimate.extras[name][0] for name in ('mirror_x', 'mirror_y')])
+    return image, 2.0 * estimate.state[0, :2] - image

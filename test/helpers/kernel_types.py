@@ -62,11 +62,8 @@ def left_out():
     """Type: why it cannot run here, for those of `TYPES` that cannot."""
     if not in_effect():
         return dict.fromkeys(TYPES, 'numpy and scipy do not use an OpenBLAS that can be asked')
-    flags = set()
-    for line in Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines():
-        if line.startswith('flags'):
-            flags = set(line.split(':', 1)[1].split())
-            break
+    lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
+    flags = set(next((line for line in lines if line.startswith('flags')), '').split())
     return {
         name: f'this processor lacks {" ".join(sorted(needs - flags))}'
         for name, needs in NEEDS.items()

@@ -120,14 +120,13 @@ def header(sec=100, frame_id='sonar'):
 
 
 def ping_info(sound_speed=1500.0):
-    widths = {'tx_beamwidths': floats([]), 'rx_beamwidths': floats([])}
+    widths = dict.fromkeys(('tx_beamwidths', 'rx_beamwidths'), floats([]))
     return make('PingInfo', frequency=450e3, sound_speed=sound_speed, **widths)
 
 
 def vectors(rows):
-    return [
-        make('geometry_msgs/msg/Vector3', x=float(x), y=float(y), z=float(z)) for x, y, z in rows
-    ]
+    kind = 'geometry_msgs/msg/Vector3'
+    return [make(kind, **dict(zip('xyz', map(float, row)))) for row in rows]
 
 
 def image_data(samples, dtype, beams=1):
@@ -175,7 +174,7 @@ def write_bag(path, records, types=None):
 
 
 def driver_message(name, **values):
-    """A message with the fields `values`, by dotted names (``position.latitude``); others zero."""
+    """A message with the fields `values`, named as for `put`; others zero."""
     return put(_zero(name), **values)
 
 
@@ -191,17 +190,14 @@ def put(message, **values):
 
 
 def _zero(name):
-    store = typestore()
-    made = []
-    for _, (node, detail) in store.fielddefs[name][1]:
+    def of(node, detail):
         if node.name == 'NAME':
-            made.append(_zero(detail))
-        elif node.name == 'ARRAY':
-            made.append(np.zeros(detail[1]))
-        elif node.name == 'SEQUENCE':
-            made.append([])
-        else:
-            kind = detail[0]
-            zeros = {'string': '', 'bool': False, 'float32': 0.0, 'float64': 0.0}
-            made.append(zeros.get(kind, 0))
-    return store.types[name](*made)
+            return _zero(detail)
+        if node.name == 'ARRAY':
+            return np.zeros(detail[1])
+        if node.name == 'SEQUENCE':
+            return []
+        return {'string': '', 'bool': False, 'float32': 0.0, 'float64': 0.0}.get(detail[0], 0)
+
+    store = typestore()
+    return store.types[name](*(of(*field) for _, field in store.fielddefs[name][1]))

@@ -27,63 +27,6 @@ from sonar_imm.nodes.qos import lockstep_qos, transforms_qos
 
 ORIGIN = Origin(54.3, 10.2)
 STEPS = 20
-
-
-def header(step, frame_id='sensor'):
-    stamp = make('builtin_interfaces/msg/Time', sec=1000 + step)
-    return make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)
-
-
-def place(step):
-    return np.array([20.0 + 0.5 * step, 10.0, -5.0])
-
-
-def xyz(kind, place):
-    return make(f'geometry_msgs/msg/{kind}', **dict(zip('xyz', map(float, place))))
-
-
-def geo_point(step):
-    degrees = dict(zip(('latitude', 'longitude', 'altitude'), ORIGIN.geodetic(place(step))))
-    return make('geographic_msgs/msg/GeoPoint', **degrees)
-
-
-def geo_pose(step):
-    return make('geographic_msgs/msg/GeoPose', position=geo_point(step))
-
-
-def sure_pose(step):
-    covariance = np.eye(6).ravel()
-    kind = 'geographic_msgs/msg/GeoPoseWithCovariance'
-    return {'pose': make(kind, pose=geo_pose(step), covariance=covariance)}
-
-
-def modem(step):
-    east, north, up = place(step)
-    return {
-        'src_id': 3, 'includes_position': True, 'position_easting': round(10.0 * east),
-        'position_northing': round(10.0 * north), 'position_depth': round(-10.0 * up),
-    }  # fmt: skip
-
-
-def usbl(step):
-    return {'enu': xyz('Vector3', place(step)), 'remote_address': 3, 'accuracy': 1.0}
-
-
-def beacon(step):
-    at = place(step) * (1.0, -1.0, -1.0)  # forward is east here: starboard is south
-    return {'beacon_id': 3, 'relative_position': xyz('Point', at)}
-
-
-def detections(step):
-    point = xyz('Point', (30.0, 2.0, 1.0))
-    pose = make('geometry_msgs/msg/Pose', position=point)
-    pose = make('geometry_msgs/msg/PoseWithCovariance', pose=pose)
-    result = make('vision_msgs/msg/ObjectHypothesisWithPose', pose=pose)
-    seen = make('vision_msgs/msg/Detection3D', header=header(step), results=[result])
-    seen.bbox.center.position = point
-    return {'detections': [seen]}
-
-
 MARINE = 'marine_acoustic_msgs/msg/'
 BEARINGS = np.radians(np.linspace(-20.0, 20.0, 9))
 SAMPLES = np.ones((60, 9), np.uint8)
@@ -91,115 +34,115 @@ SAMPLES[30, 4] = 250
 """An echo straight ahead at half the range."""
 
 
-def vectors(bearings):
-    return [xyz('Vector3', (np.cos(b), np.sin(b), 0.0)) for b in bearings]
+def xyz(*place):
+    return dict(zip('xyz', map(float, place)))
 
 
-def ping(**values):
-    info = make(MARINE + 'PingInfo', frequency=450e3, sound_speed=1500.0)
-    return {'ping_info': info, **values}
-
-
-def image(**values):
-    data = make(MARINE + 'SonarImageData', beam_count=9, data=SAMPLES.tobytes())
-    return ping(image=data, **values)
-
-
-def oculus(step):
+def fields(step):
+    """Of each type the fields beside the header; those of a message in it as a mapping."""
+    east, north, up = place = np.array([20.0 + 0.5 * step, 10.0, -5.0])
+    point = {'position': dict(zip(('latitude', 'longitude', 'altitude'), ORIGIN.geodetic(place)))}
+    seen = {'position': xyz(30.0, 2.0, 1.0)}
+    ping = {'ping_info': {'frequency': 450e3, 'sound_speed': 1500.0}}
+    image = {'image': {'beam_count': 9, 'data': SAMPLES.tobytes()}, **ping}
+    rays = [xyz(np.cos(bearing), np.sin(bearing), 0.0) for bearing in (0.1, *BEARINGS)]
     return {
-        'range_resolution': 0.5, 'n_ranges': 60, 'n_beams': 9, 'step': 9, 'sample_size': 1,
-        'bearings': np.linspace(-2000, 2000, 9).astype(np.int16), 'ping_data': SAMPLES.tobytes(),
+        'geographic_msgs/msg/GeoPointStamped': point,
+        'geographic_msgs/msg/GeoPoseStamped': {'pose': point},
+        'geographic_msgs/msg/GeoPoseWithCovarianceStamped':
+            {'pose': {'pose': point, 'covariance': np.eye(6).ravel()}},
+        'seatrac_interfaces/msg/ModemRec': {
+            'src_id': 3, 'includes_position': True, 'position_easting': round(10.0 * east),
+            'position_northing': round(10.0 * north), 'position_depth': round(-10.0 * up)},
+        'acomms_msgs/msg/UsblData': {'enu': xyz(*place), 'remote_address': 3, 'accuracy': 1.0},
+        # Forward is east here: starboard is south.
+        'stonefish_ros2/msg/BeaconInfo':
+            {'beacon_id': 3, 'relative_position': xyz(east, -north, -up)},
+        'vision_msgs/msg/Detection3DArray': {'detections': [{
+            'header': header(step), 'results': [{'pose': {'pose': seen}}],
+            'bbox': {'center': seen}}]},
+        MARINE + 'SonarDetections': {'two_way_travel_times': [0.04], 'rx_angles': [0.1], **ping},
+        MARINE + 'SonarRanges': {'beam_unit_vec': rays[:1], 'ranges': [30.0], **ping},
+        **dict.fromkeys((MARINE + 'Dvl', 'stonefish_ros2/msg/DVL'), {'altitude': 12.0}),
+        'dave_interfaces/msg/DVL': {'target': {'type': 'bottom', 'range': 12.0}},
+        MARINE + 'ProjectedSonarImage':
+            {'beam_directions': rays[1:], 'ranges': 1.0 + 0.5 * np.arange(60), **image},
+        MARINE + 'RawSonarImage':
+            {'sample_rate': 1500.0, 'samples_per_beam': 60, 'rx_angles': BEARINGS, **image},
+        'oculus_interfaces/msg/Ping': {
+            'range_resolution': 0.5, 'n_ranges': 60, 'n_beams': 9, 'step': 9, 'sample_size': 1,
+            'bearings': np.linspace(-2000, 2000, 9).astype(np.int16),
+            'ping_data': SAMPLES.tobytes()},
+        'ping360_sonar_msgs/msg/SonarEcho': {  # it turns back once, which ends a sweep
+            'angle': 0.05 * abs(10 - step), 'range': 30, 'intensities': SAMPLES[:, 4].tobytes()},
+        'sensors/msg/SonoptixECHO': {'array_data': {
+            'layout': {'dim': [{'size': n} for n in SAMPLES.shape]}, 'data': SAMPLES.ravel()}},
+        'marine_interfaces/msg/SonarInfo': {
+            'intensity_quantity': 3, 'intensity_scale': 1, 'pulse_lengths': [4e-4],
+            'tx_signal_types': [1]},
     }  # fmt: skip
 
 
-def ping360(step):
-    angle = 0.05 * abs(10 - step)  # it turns back once, which ends a sweep
-    return {'angle': angle, 'range': 30, 'intensities': SAMPLES[:, 4].tobytes()}
-
-
-def sonoptix(step):
-    dims = [make('std_msgs/msg/MultiArrayDimension', size=n) for n in SAMPLES.shape]
-    layout = make('std_msgs/msg/MultiArrayLayout', dim=dims)
-    data = make('std_msgs/msg/Float32MultiArray', layout=layout, data=SAMPLES.ravel())
-    return {'array_data': data}
-
-
-def sonar_info(step):
-    return {
-        'intensity_quantity': 3, 'intensity_scale': 1, 'pulse_lengths': [4e-4],
-        'tx_signal_types': [1],
-    }  # fmt: skip
+def header(step):
+    return {'stamp': {'sec': 1000 + step}, 'frame_id': 'sensor'}
 
 
 GEODETIC = {'origin': [ORIGIN.latitude, ORIGIN.longitude, 0.0]}
-FIXED = {'vessel': 'fixed'}
 SCREEN = {'image_far_range': 30.0, 'image_fov_deg': 40.0}
 PICTURES = {'input_types': ['image=sensor_msgs/msg/Image']}
-CASES = {
-    'geographic_msgs/msg/GeoPointStamped':
-        (DiverNode, 'fix', lambda step: {'position': geo_point(step)}, GEODETIC),
-    'geographic_msgs/msg/GeoPoseStamped':
-        (DiverNode, 'fix', lambda step: {'pose': geo_pose(step)}, GEODETIC),
-    'geographic_msgs/msg/GeoPoseWithCovarianceStamped': (DiverNode, 'fix', sure_pose, GEODETIC),
-    'seatrac_interfaces/msg/ModemRec': (DiverNode, 'relative', modem, FIXED),
-    'acomms_msgs/msg/UsblData': (DiverNode, 'relative', usbl, FIXED),
-    'stonefish_ros2/msg/BeaconInfo': (DiverNode, 'relative', beacon, FIXED),
-    'vision_msgs/msg/Detection3DArray': (ObstacleNode, 'detections', detections, {}),
-    MARINE + 'SonarDetections': (ObstacleNode, 'detections', lambda step: ping(
-        two_way_travel_times=[0.04], rx_angles=[0.1]), {}),
-    MARINE + 'SonarRanges': (ObstacleNode, 'detections', lambda step: ping(
-        beam_unit_vec=vectors([0.1]), ranges=[30.0]), {}),
-    **dict.fromkeys((MARINE + 'Dvl', 'stonefish_ros2/msg/DVL'), (
-        ObstacleNode, 'altitude', lambda step: {'altitude': 12.0}, {})),
-    'dave_interfaces/msg/DVL': (ObstacleNode, 'altitude', lambda step: {
-        'target': make('dave_interfaces/msg/DVLTarget', type='bottom', range=12.0)}, {}),
-    MARINE + 'ProjectedSonarImage': (FlsDetectorNode, 'image', lambda step: image(
-        beam_directions=vectors(BEARINGS), ranges=1.0 + 0.5 * np.arange(60)), {}),
-    MARINE + 'RawSonarImage': (FlsDetectorNode, 'image', lambda step: image(
-        sample_rate=1500.0, samples_per_beam=60, rx_angles=BEARINGS), {}),
-    'oculus_interfaces/msg/Ping': (FlsDetectorNode, 'image', oculus, {}),
-    'ping360_sonar_msgs/msg/SonarEcho': (FlsDetectorNode, 'image', ping360, {}),
-    'sensors/msg/SonoptixECHO': (FlsDetectorNode, 'image', sonoptix, SCREEN),
-    'marine_interfaces/msg/SonarInfo': (FlsDetectorNode, 'sonar_info', sonar_info, PICTURES),
-}  # fmt: skip
-"""Of each type the node, the input, its fields beside the header, and parameters."""
 
 
-def run(type_name, kind, name, fields, settings):
+def place_of(name):
+    """Which node hears a type on which input, with which parameters."""
+    package, _, kind = name.split('/')
+    if package == 'geographic_msgs':
+        return DiverNode, 'fix', GEODETIC
+    if kind in ('ModemRec', 'UsblData', 'BeaconInfo'):
+        return DiverNode, 'relative', {'vessel': 'fixed'}
+    if kind.upper() == 'DVL':
+        return ObstacleNode, 'altitude', {}
+    if kind in ('Detection3DArray', 'SonarDetections', 'SonarRanges'):
+        return ObstacleNode, 'detections', {}
+    if kind == 'SonarInfo':
+        return FlsDetectorNode, 'sonar_info', PICTURES
+    return FlsDetectorNode, 'image', SCREEN if kind == 'SonoptixECHO' else {}
+
+
+def built(type_name, fields):
+    """A message of its fields."""
+    kinds = message_class(type_name).get_fields_and_field_types()
+
+    def of(name, value):
+        kind = kinds[name].removeprefix('sequence<').removesuffix('>').replace('/', '/msg/')
+        if isinstance(value, dict):
+            return built(kind, value)
+        if isinstance(value, list):
+            return [built(kind, each) if isinstance(each, dict) else each for each in value]
+        return value
+
+    return make(type_name, **{name: of(name, value) for name, value in fields.items()})
+
+
+def run(type_name):
     """Publish `STEPS` messages to a node of its own, each when the one before is answered."""
-    types = [f'{name}={type_name}', *settings.get('input_types', [])]
-    quality = lockstep_qos()
-    if name == 'sonar_info':
-        quality = transforms_qos()
-        del types[0]
-    settings = {**settings, 'input_types': types}
+    kind, name, settings = place_of(type_name)
+    types = [f'{name}={type_name}'] if name != 'sonar_info' else []
+    quality = lockstep_qos() if types else transforms_qos()
+    settings = {**settings, 'input_types': [*types, *settings.get('input_types', [])]}
     bench = Bench()
     try:
         overrides = [Parameter(key, value=value) for key, value in settings.items()]
-        node = bench.add(kind(context=bench.context, parameter_overrides=overrides))
-        places, in_degrees = [], settings.keys() >= GEODETIC.keys()
-        if in_degrees:
-            places = bench.listen(message_class('sensor_msgs/msg/NavSatFix'), '/diver/geo')
-            bench.spin_until(lambda: node.count_subscribers('/diver/geo'))
+        node = bench.start(kind, parameter_overrides=overrides)
         publisher = bench.publisher(type_name, f'/{name}', quality)
         for step in range(STEPS):
-            publisher.publish(make(type_name, header=header(step), **fields(step)))
+            values = {'header': header(step), **fields(step)[type_name]}
+            publisher.publish(built(type_name, values))
             bench.spin_until(lambda step=step: node.answer()['messages'] > step)
-        if in_degrees:
-            bench.spin_until(lambda: places)
-        return {**node.answer(), **last(places)}
+        return node.answer()
     finally:
         bench.close()
 
 
-def last(places):
-    """The distance between the last place of the diver in degrees and the true one, in metres."""
-    if not places:
-        return {}
-    off = ORIGIN.local(places[-1].latitude, places[-1].longitude, 0.0)[:2] - place(STEPS - 1)[:2]
-    return {'off': float(np.hypot(*off))}
-
-
 if __name__ == '__main__':
-    wanted = sys.argv[1:] or CASES
-    print(json.dumps({name: run(name, *CASES[name]) for name in wanted}))
+    wanted = sys.argv[1:] or fields(0)
+    print(json.dumps({name: run(name) for name in wanted}))

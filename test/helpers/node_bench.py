@@ -52,18 +52,23 @@ class Held:
 class Bench:
     """A context of its own with a peer node, and an executor to spin everything on."""
 
-    def __init__(self, args=()):
+    def __init__(self, *args, p=(), domain_id=None):
+        """With ROS arguments as on a command line; p: parameters, ``name:=value``."""
         self.context = rclpy.Context()
+        words = [*args, *(word for each in p for word in ('-p', each))]
         rclpy.init(
-            args=['bench', '--ros-args', *args] if args else None,
+            args=['bench', '--ros-args', *words] if words else None,
             context=self.context,
+            domain_id=domain_id,  # None: as the environment says
             signal_handler_options=rclpy.signals.SignalHandlerOptions.NO,
         )
         self.executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
         self.nodes = []
-        self.peer = self.add(
-            rclpy.node.Node('peer', context=self.context, use_global_arguments=False)
-        )
+        self.peer = self.start(rclpy.node.Node, 'peer', use_global_arguments=False)
+
+    def start(self, kind, *args, **options):
+        """A node of this class, which is spun."""
+        return self.add(kind(*args, context=self.context, **options))
 
     def add(self, node):
         self.nodes.append(node)
@@ -76,6 +81,12 @@ class Bench:
         while not predicate():
             assert time.monotonic() < end, 'what was waited for did not happen'
             self.executor.spin_once(timeout_sec=0.02)
+
+    def end(self, node):
+        """Stop a node, so that it saves what it keeps."""
+        self.nodes.remove(node)
+        self.executor.remove_node(node)
+        node.destroy_node()
 
     def listen(self, message_type, topic, qos=10):
         """Collect what comes on `topic`."""
@@ -114,15 +125,20 @@ class Bench:
 
 @pytest.fixture
 def make_bench():
-    """Make benches, each with ROS arguments as on a command line; all are closed at the end."""
+    """Make benches; all are closed at the end."""
     with contextlib.ExitStack() as stack:
 
-        def begin(*args):
-            bench = Bench(args)
+        def begin(*args, **options):
+            bench = Bench(*args, **options)
             stack.callback(bench.close)
             return bench
 
         yield begin
+
+
+def values_of(report):
+    """The values of a message of /diagnostics, by key."""
+    return {pair.key: pair.value for status in report.status for pair in status.values}
 
 
 @pytest.fixture
@@ -150,17 +166,14 @@ def a_fix(seconds, x=1.0, y=2.0, frame_id='map'):
     return write_fix(Fix(stamp_ns=round(seconds * SECOND), **place), make)
 
 
-class Rig:
-    """A walker node with everything connected to it."""
+class Driven:
+    """A node that is active, what it publishes, and what sends to it in lock-step."""
 
-    def __init__(self, bench, *, publish=FIX, qos=10, prefix='', name='walker'):
-        self.bench = bench
-        self.node = bench.add(TrackerNode('walker', context=bench.context))
-        self.name = f'{prefix}/{name}'
-        self.estimates = bench.listen(PointCloud2, f'{self.name}/estimate', lockstep_qos())
-        self.answers = bench.listen(PointCloud2, f'{self.name}/processed', latched_qos())
-        self.fix = bench.peer.create_publisher(message_class(publish), f'{prefix}/fix', qos)
-        bench.spin_until(lambda: self.answers and self.fix.get_subscription_count())
+    def __init__(self, bench, node, name):
+        self.bench, self.node, self.name = bench, node, name
+        self.estimates = bench.listen(PointCloud2, f'{name}/estimate', lockstep_qos())
+        self.answers = bench.listen(PointCloud2, f'{name}/processed', latched_qos())
+        bench.spin_until(lambda: self.answers)
 
     @property
     def answer(self):
@@ -168,13 +181,27 @@ class Rig:
         columns = decode_table(self.answers[-1])
         return tuple(int(columns[name][0]) for name in ('messages', 'refused', 'estimates'))
 
-    def send(self, *messages):
+    def publish(self, publisher, *messages):
         """Publish one after another, each when the one before has been answered."""
         for message in messages:
             answered = self.answer[0]
-            self.fix.publish(message)
+            publisher.publish(message)
             self.bench.spin_until(lambda before=answered: self.answer[0] > before)
         self.bench.spin_until(lambda: len(self.estimates) >= self.answer[2])
+
+
+class Rig(Driven):
+    """A walker node with everything connected to it."""
+
+    def __init__(self, bench, *, publish=FIX, qos=10, topic='/fix', name='/walker'):
+        super().__init__(bench, bench.start(TrackerNode, 'walker'), name)
+        self.fix = bench.publisher(publish, topic, qos)
+
+    def send(self, *messages):
+        self.publish(self.fix, *messages)
+
+    def end(self):
+        self.bench.end(self.node)
 
     def means(self):
         return [(e.stamp_ns / SECOND, *e.state[0, :2]) for e in map(read_estimate, self.estimates)]

@@ -14,8 +14,8 @@ from sonar_imm.measurements import Rejection
 
 
 def reason(read, *message, **options):
-    """The code of the refusal, which has to have a sentence of one line."""
+    """The code of the refusal, which has to have a sentence of one line without a full stop."""
     with pytest.raises(Rejection) as caught:
         read(*message, **options)
-    assert caught.value.sentence and '\n' not in caught.value.sentence
+    assert caught.value.sentence[-1] != '.' and '\n' not in caught.value.sentence
     return caught.value.reason

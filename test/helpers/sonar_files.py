@@ -39,7 +39,7 @@ def xtf_head(channels):
     return head
 
 
-def xtf_ping(seconds, samples, place=PLACE, slant_range=50.0, **more):
+def xtf_ping(seconds, samples, place=PLACE, slant_range=50.0, delay=0.0, **more):
     """One ping; samples: of each channel, as they lie in the file."""
     import pyxtf
 
@@ -55,13 +55,13 @@ def xtf_ping(seconds, samples, place=PLACE, slant_range=50.0, **more):
     ping.SensorHeading, ping.SensorDepth, ping.SensorPrimaryAltitude = 90.0, 5.0, 12.0
     for name, value in more.items():
         setattr(ping, name, value)
-    ping.ping_chan_headers, ping.data = [], []
+    ping.ping_chan_headers, ping.data = [], list(samples)
     for number, row in enumerate(samples):
         channel = pyxtf.XTFPingChanHeader()
         channel.ChannelNumber, channel.NumSamples = number, len(row)
         channel.SlantRange, channel.TimeDuration = slant_range, slant_range / 750.0
+        channel.TimeDelay = delay
         ping.ping_chan_headers.append(channel)
-        ping.data.append(row)
     size = len(ping.to_bytes())
     ping.NumBytesThisRecord = pyxtf.xtf_io.xtf_padding(size)
     return ping.to_bytes().ljust(ping.NumBytesThisRecord, b'\0')

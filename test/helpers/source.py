@@ -15,11 +15,8 @@ from pathlib import Path
 import subprocess
 
 ROOT = Path(__file__).resolve().parents[2]
-MODULES = sorted(
-    path
-    for room in ('sonar_imm', 'sonar_imm_tools', 'msg_adapters')
-    for path in (ROOT / room).rglob('*.py')
-)
+ROOMS = 'sonar_imm', 'sonar_imm_tools', 'msg_adapters'
+MODULES = sorted(path for room in ROOMS for path in (ROOT / room).rglob('*.py'))
 
 COMMON_INTERFACES = {
     'actionlib_msgs', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'sensor_msgs', 'shape_msgs',
@@ -43,8 +40,7 @@ def known_module(modules, name):
 
 def circle_of(graph):
     """A way from a module over its imports back to it, or None."""
-    done = set()
-    way = []
+    done, way = set(), []
 
     def visit(name):
         if name in way:

@@ -13,15 +13,8 @@ from pathlib import Path
 from msg_adapters.estimates import write_estimate
 from sonar_imm.intake import Intake
 from sonar_imm.measurements import Rejection
-from sonar_imm.trackers import SYSTEMS
-from sonar_imm.trackers.state_file import (
-    intake_from,
-    json_parameters,
-    read_state,
-    Saved,
-    state_of,
-    write_state,
-)
+from sonar_imm.trackers import state_file, SYSTEMS
+from sonar_imm.trackers.state_file import intake_from, read_state, Saved, write_state
 from sonar_imm_tools.cli.common import load_config
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.messages import ros_message
@@ -55,10 +48,9 @@ class Tracked:
         with BagReader(bag) as reader:
             read = measurements_of(reader, self.system.name, settings=self.config.as_dict())
             found = [item.measurement for item in read]
-        self.input = [m for m in found if m is not None and not isinstance(m, Rejection)]
-        self.input = self.input[: MOST[self.system.name]]
-        tracker = self.build()
-        self.whole = [published(tracker, m) for m in self.input]
+        good = [m for m in found if m is not None and not isinstance(m, Rejection)]
+        self.input, tracker = good[: MOST[self.system.name]], self.build()
+        self.whole = published(tracker, self.input)
         self.counts = tracker.counts
 
     def build(self):
@@ -78,8 +70,8 @@ class Tracked:
 def saved(intake, system):
     """The state of a tracker of a system, and of the intake before it."""
     return Saved(
-        system=system.name, parameters=json_parameters(intake.tracker.config), saved_ns=5,
-        newest_ns=7, state=state_of(intake),
+        system=system.name, parameters=state_file.json_parameters(intake.tracker.config),
+        saved_ns=5, newest_ns=7, state=state_file.state_of(intake),
     )  # fmt: skip
 
 
@@ -94,14 +86,14 @@ def resumed(path, tracker, name):
     return tracker_from(read_state(path), SYSTEMS[name], tracker.config)
 
 
-def published(tracker, measurement):
-    """What a tracker publishes of a measurement, as bytes."""
-    return [as_bytes(estimate) for estimate in tracker.process(measurement)]
+def published(tracker, measurements):
+    """What a tracker publishes of each measurement, as bytes."""
+    return [as_bytes(tracker.process(measurement)) for measurement in measurements]
 
 
-def as_bytes(estimate):
-    message = write_estimate(estimate, ros_message)
-    return message.header.stamp.sec, message.header.stamp.nanosec, bytes(message.data)
+def as_bytes(estimates):
+    messages = [write_estimate(estimate, ros_message) for estimate in estimates]
+    return [(m.header.stamp.sec, m.header.stamp.nanosec, bytes(m.data)) for m in messages]
 
 
 tracked = functools.cache(Tracked)

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""A small real system for tests of the nodes: the walker. As a program, its node."""
+"""A small real system for tests of the nodes: the walker."""
 
 from collections import Counter
 import sys
@@ -46,7 +46,6 @@ class WalkerTracker:
     """The running mean of the fixes, in the order of their stamps; late ones revise it."""
 
     STATE = ('counts', 'fixes', 'frames')
-
     counts: Counter[str]
     fixes: dict[int, Any]
     frames: KnownFrames
@@ -78,9 +77,8 @@ class WalkerTracker:
             return []
         self.counts['used'] += 1
         self.fixes[measurement.stamp_ns] = measurement
-        return [
-            self._estimate(stamp) for stamp in sorted(self.fixes) if stamp >= measurement.stamp_ns
-        ]
+        stamps = sorted(stamp for stamp in self.fixes if stamp >= measurement.stamp_ns)
+        return [self._estimate(stamp) for stamp in stamps]
 
     def _estimate(self, stamp):
         used = [fix.position for key, fix in self.fixes.items() if key <= stamp]
@@ -92,9 +90,8 @@ class WalkerTracker:
             covariance=np.stack([np.diag([1.0, 2.0, 3.0, 4.0])] * 2), model_names=('slow', 'fast'),
             probabilities=np.array([[self.config.slow_share, self.config.fast_share]] * 2),
             extras={
-                'track_id': np.array([7, 4], np.uint32),
+                'track_id': np.array([7, 4], np.uint32), 'nis': np.full(2, 0.5),
                 'track_state': np.array([1, 2], np.uint8),
-                'nis': np.full(2, 0.5),
             },
         )  # fmt: skip
 
@@ -118,15 +115,3 @@ def register(set_item):
     set_item(SYSTEMS, 'walker', walker)
     set_item(sys.modules, 'msg_adapters.displays.walker', msg_adapters.displays.bathymetry)
     set_item(sys.modules, 'msg_adapters.inputs.walker', msg_adapters.inputs.diver)
-
-
-def main():
-    from sonar_imm.nodes.base import TrackerNode
-    from sonar_imm.nodes.running import run
-
-    register(dict.__setitem__)
-    return run(lambda: TrackerNode('walker'))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -14,16 +14,24 @@
 import warnings
 
 from helpers.hostile.files import file_results, FILES
-from helpers.hostile.mutations import MUTATIONS
-from helpers.hostile.runs import Bad, BATCH, batches, run, run_extreme, Tally
+from helpers.hostile.runs import Bad, BATCH, batches, MUTATIONS, run, run_extreme, Tally
 from helpers.hostile.streams import stream, templates, VARIANTS
 from hypothesis import given, HealthCheck, settings
-import numpy as np
 import pytest
 
 from msg_adapters.inputs import inputs_of, made_inputs
-from sonar_imm.measurements import Fixes
 from sonar_imm.trackers import SYSTEMS
+
+ONCE = [
+    ('diver', 3, {3: 1048575, 15: 11047, 19: 257408}),  # existence above 1
+    ('diver', 3, {2: 297, 3: 20451, 7: 1633}),  # the same, of one
+    ('fathometer', 0, {2: 146, 9: 300657}),  # a record that no set explains
+    # Births where all free cells have lost their weight.
+    ('fathometer', 2, {7: 1188873, 10: 33531}),
+    ('fathometer', 0, {18: 3606393, 35: 93705795}),
+    ('fathometer', 0, {7: 9, 37: 75}),  # all cells are within the aperture
+    ('fathometer', 0, {49: 230133}),  # an echo narrower than any pulse
+]
 
 
 @pytest.mark.parametrize('system', SYSTEMS)
@@ -41,19 +49,7 @@ def test_no_message_breaks_a_tracker(system):
     assert tally.read > 0.5 * tally.cases and len(tally.refused) >= 5 and tally.counted
 
 
-@pytest.mark.parametrize(
-    'system, variant, numbers',
-    [
-        ('diver', 3, {3: 1048575, 15: 11047, 19: 257408}),  # existence above 1
-        ('diver', 3, {2: 297, 3: 20451, 7: 1633}),  # the same, of one
-        ('fathometer', 0, {2: 146, 9: 300657}),  # a record that no set explains
-        # Births where all free cells have lost their weight.
-        ('fathometer', 2, {7: 1188873, 10: 33531}),
-        ('fathometer', 0, {18: 3606393, 35: 93705795}),
-        ('fathometer', 0, {7: 9, 37: 75}),  # all cells are within the aperture
-        ('fathometer', 0, {49: 230133}),  # an echo narrower than any pulse
-    ],
-)
+@pytest.mark.parametrize('system, variant, numbers', ONCE)
 def test_messages_that_once_broke_a_tracker(system, variant, numbers):
     run(system, (variant, [Bad.of(system, numbers.get(k, 0)) for k in range(50)]))
 
@@ -84,34 +80,6 @@ def test_every_type_of_every_input_is_tried(system):
     tally = Tally()
     run(system, (0, [Bad(i, unchanged, 5) for i in range(len(tried))]), tally)
     assert tally.read >= 0.75 * len(tried)  # good messages are good
-
-
-def test_an_error_of_the_sound_speed_concerns_fixes_alone_too():
-    """A configuration by which the diver's tracker once fell over the first fix."""
-    run_with = SYSTEMS['diver'].config_type().from_mapping({'sound_speed_std': 5.0})
-    tracker = SYSTEMS['diver'].build(run_with)
-    entries = {entry.name: entry for entry in inputs_of('diver')}
-    found = []
-    for name, type_name, message in stream('diver', 0):
-        found += tracker.process(entries[name].readers[type_name](message))
-    assert len(found) == len(stream('diver', 0))
-
-
-def test_no_more_divers_than_allowed_are_followed():
-    """Three that are plainly there: as many as the limit says, and all without it."""
-    for most, wanted in ((2, 2), (20, 3)):
-        tracker = SYSTEMS['diver'].build(
-            SYSTEMS['diver'].config_type().from_mapping({'max_tracks': most})
-        )
-        for k in range(10):
-            position = [[0.5 * k, 0.0, 0.0], [0.5 * k, 60.0, 0.0], [0.5 * k, 120.0, 0.0]]
-            scan = Fixes(
-                stamp_ns=(1000 + k) * 10**9,
-                position=position,
-                covariance=np.tile(0.1 * np.eye(2), (3, 1, 1)),
-            )
-            last = tracker.process(scan)[-1]
-        assert (last.extras['track_state'] > 0).sum() == wanted
 
 
 @pytest.mark.statistics

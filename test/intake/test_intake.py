@@ -9,30 +9,20 @@
 """What /tf_static says: the place of a sonar on its vehicle, and measurements in another frame."""
 
 from collections import deque
+import contextlib
 
 import attrs
 from attrs import evolve
 from helpers.diver_runs import arrivals
+from helpers.refusals import reason
 import numpy as np
 import pytest
 
+from sonar_imm import measurements
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.intake import Intake, KnownFrames, MOST_FRAMES, moved, TransformTree
-from sonar_imm.measurements import (
-    Altitude,
-    ArrayDepth,
-    Detections,
-    Fix,
-    Fixes,
-    Navigation,
-    NOBODY,
-    Rejection,
-    RelativeFix,
-    Snapshot,
-    Start,
-    StaticTransforms,
-)
+from sonar_imm.measurements import Altitude, Detections, Fix, Fixes, Navigation, NOBODY, Rejection
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
@@ -43,12 +33,20 @@ from sonar_imm_tools.simulation.obstacle import simulator as obstacle
 LEVER, RPY = (1.5, -0.3, 0.4), (2.0, -15.0, 8.0)
 MOUNT = Pose(np.array(LEVER), geometry.rotation(*np.radians(RPY)))
 FRAMES = {'vehicle_frame': 'base_link', 'sonar_frame': 'sonar'}
-TRANSFORMS = StaticTransforms(
-    poses={
-        'sonar': ('bracket', Pose(np.zeros(3), MOUNT.R)),
-        'bracket': ('base_link', Pose(MOUNT.position, np.eye(3))),
-    }
-)
+
+
+def transforms(stamp_ns=None, **poses):
+    """What is said of frames: the parent of each and its pose there."""
+    stamp = {} if stamp_ns is None else {'stamp_ns': stamp_ns}
+    return measurements.StaticTransforms(poses=poses, **stamp)
+
+
+def shift(x, y=0.0, z=0.0):
+    return Pose(np.array([x, y, z]), np.eye(3))
+
+
+BRACKET = 'bracket', Pose(np.zeros(3), MOUNT.R)
+TRANSFORMS = transforms(sonar=BRACKET, bracket=('base_link', shift(*LEVER)))
 
 
 def scene_of(system):
@@ -59,13 +57,16 @@ def scene_of(system):
     return scene, swath.simulate(scene, 1).measurements
 
 
-def run(system, transforms=None, **parameters):
+def built(system, **parameters):
+    return SYSTEMS[system].build(SYSTEMS[system].config_type()(**parameters))
+
+
+def run(system, *transforms, **parameters):
     """The last estimate, the reasons of refusals, and the tracker."""
     scene, received = scene_of(system)
-    config = SYSTEMS[system].config_type()(**{**scene.instruments(), **parameters})
-    tracker = SYSTEMS[system].build(config)
+    tracker = built(system, **{**scene.instruments(), **parameters})
     intake, made, refused = Intake(tracker), [], []
-    for item in [*([transforms] if transforms else []), *(item.measurement for item in received)]:
+    for item in (*transforms, *(item.measurement for item in received)):
         try:
             measurement = intake.admit(item)
         except Rejection as rejection:
@@ -85,84 +86,25 @@ def test_a_mounting_that_transforms_say_is_that_of_the_parameters(system):
     assert tracker.config.sonar_mount_rpy_deg == pytest.approx(RPY)
     assert mounted.state == pytest.approx(by_hand.state, rel=1e-9, abs=1e-9, nan_ok=True)
     assert mounted.xyz == pytest.approx(by_hand.xyz, rel=1e-5, abs=1e-5, nan_ok=True)
-    assert plain.state.shape != mounted.state.shape or not np.allclose(
-        plain.state, mounted.state, equal_nan=True
-    )
-
-
-@pytest.mark.parametrize('system', ['obstacle', 'bathymetry'])
-def test_pings_before_the_mounting_is_known_are_refused_by_name(system):
-    with pytest.raises(ConfigError, match='need each other'):
-        SYSTEMS[system].config_type()(sonar_frame='sonar')
+    assert not np.array_equal(plain.state, mounted.state, equal_nan=True)
+    # Before it is known pings are refused by name.
     last, refused, _ = run(system, **FRAMES)
     assert last is None and {item.reason for item in refused} == {'no_mounting'}
     assert "'sonar' is on 'base_link'" in refused[0].sentence
+    with pytest.raises(ConfigError, match='need each other'):
+        built(system, sonar_frame='sonar')
 
 
 def test_a_change_of_parameters_keeps_the_mounting():
-    config = SYSTEMS['obstacle'].config_type()(**FRAMES)
-    tracker = SYSTEMS['obstacle'].build(config)
-    intake = Intake(tracker)
+    tracker = built('obstacle', **FRAMES)
+    config, intake = tracker.config, Intake(tracker)
     intake.admit(TRANSFORMS)
     intake.reconfigure(evolve(config, detection_probability=0.5))
     assert tracker.config.detection_probability == 0.5 and tracker.config.sonar_lever == LEVER
 
 
-def fix(frame_id, x):
-    return Fix(stamp_ns=10**9, position=[x, 0.0, 0.0], covariance=np.eye(2), frame_id=frame_id)
-
-
-def test_a_position_in_another_frame_is_turned_where_the_transform_is_known():
-    intake = Intake(SYSTEMS['diver'].build(SYSTEMS['diver'].config_type()()), 'map')
-    with pytest.raises(Rejection, match="'pier' is not the frame 'map'"):
-        intake.admit(fix('pier', 1.0))
-    quarter = Pose(np.array([100.0, 0.0, 0.0]), geometry.rotation(0.0, 0.0, np.pi / 2.0))
-    intake.admit(StaticTransforms(poses={'pier': ('map', quarter)}))
-    made = intake.admit(fix('pier', 1.0))
-    assert made.frame_id == 'map' and made.position == pytest.approx([100.0, 1.0, 0.0])
-    assert intake.admit(fix('map', 1.0)).position.tolist() == [1.0, 0.0, 0.0]
-    with pytest.raises(Rejection, match="'odom' is not the frame 'map'"):
-        intake.admit(fix('odom', 1.0))
-
-
-def test_an_altimeter_in_another_frame_is_turned_where_the_transform_is_known():
-    intake = Intake(SYSTEMS['bathymetry'].build(SYSTEMS['bathymetry'].config_type()()))
-
-    def take(frame_id):
-        made = intake.admit(Altitude(stamp_ns=10**9, altitude=9.0, frame_id=frame_id))
-        intake.tracker.process(made)
-        return made
-
-    assert take('dvl').altitude == 9.0
-    with pytest.raises(Rejection, match="'altimeter' is not .* and no fixed transform joins"):
-        take('altimeter')
-    above = Pose(np.array([0.0, 0.0, 1.5]), np.eye(3))
-    intake.admit(StaticTransforms(poses={'altimeter': ('dvl', above)}))
-    made = take('altimeter')
-    assert made.altitude == 7.5 and made.frame_id == 'dvl'
-
-
-def test_a_late_altitude_does_not_shut_out_the_later_ones():
-    tracker = SYSTEMS['obstacle'].build(SYSTEMS['obstacle'].config_type()())
-    intake = Intake(tracker)
-
-    def take(second, frame_id):
-        altitude = Altitude(stamp_ns=second * 10**9, altitude=9.0, frame_id=frame_id)
-        tracker.process(intake.admit(altitude))
-
-    level = {'position': [0.0, 0.0, 0.0], 'orientation': [0.0, 0.0, 0.0, 1.0], 'frame_id': 'map'}
-    for second in range(5000, 5005):
-        tracker.process(intake.admit(Navigation(stamp_ns=second * 10**9, **level)))
-    take(4000, 'another')
-    assert tracker.counts['too_late'] == 1
-    take(5005, 'altimeter')
-    assert tracker.counts['used'] == 6
-    with pytest.raises(Rejection, match="'another' is not the frame 'altimeter'"):
-        take(5006, 'another')
-
-
 def test_a_required_frame_survives_a_reset_and_a_first_one_does_not():
-    tracker = SYSTEMS['diver'].build(SYSTEMS['diver'].config_type()())
+    tracker = built('diver')
     for required in ('', 'map'):
         intake = Intake(tracker, required)
         tracker.process(intake.admit(fix('map', 1.0)))
@@ -170,30 +112,76 @@ def test_a_required_frame_survives_a_reset_and_a_first_one_does_not():
         with refused:
             intake.admit(fix('odom', 2.0))
         intake.reset()
-        if required:
-            with refused:
-                intake.admit(fix('odom', 2.0))
-        else:
+        with refused if required else contextlib.nullcontext():
             assert intake.admit(fix('odom', 2.0)).frame_id == 'odom'
-
-
-def test_an_array_keeps_to_its_first_frame():
+    # An array keeps to its first frame too.
     scene, received = scene_of('bathymetry')
-    snapshot = next(x.measurement for x in received if isinstance(x.measurement, Snapshot))
-    config = SYSTEMS['bathymetry'].config_type()(**scene.instruments())
-    intake = Intake(SYSTEMS['bathymetry'].build(config))
+    pings = (item.measurement for item in received)
+    snapshot = next(ping for ping in pings if isinstance(ping, measurements.Snapshot))
+    intake = Intake(built('bathymetry', **scene.instruments()))
     first = evolve(snapshot, frame_id='array')
     assert intake.admit(first) is first
     with pytest.raises(Rejection, match="'hull' is not the frame 'array'"):
         intake.admit(evolve(snapshot, frame_id='hull'))
 
 
+def fix(frame_id, x=0.0):
+    return Fix(stamp_ns=10**9, position=[x, 0.0, 0.0], covariance=np.eye(2), frame_id=frame_id)
+
+
+def level(frame_id, stamp_ns=1):
+    place = {'position': [0.0, 0.0, 0.0], 'orientation': [0.0, 0.0, 0.0, 1.0]}
+    return Navigation(stamp_ns=stamp_ns, frame_id=frame_id, **place)
+
+
+def test_a_position_in_another_frame_is_turned_where_the_transform_is_known():
+    intake = Intake(built('diver'), 'map')
+    with pytest.raises(Rejection, match="'pier' is not the frame 'map'"):
+        intake.admit(fix('pier', 1.0))
+    quarter = Pose(np.array([100.0, 0.0, 0.0]), geometry.rotation(0.0, 0.0, np.pi / 2.0))
+    intake.admit(transforms(pier=('map', quarter)))
+    made = intake.admit(fix('pier', 1.0))
+    assert made.frame_id == 'map' and made.position == pytest.approx([100.0, 1.0, 0.0])
+    assert intake.admit(fix('map', 1.0)).position.tolist() == [1.0, 0.0, 0.0]
+    with pytest.raises(Rejection, match="'odom' is not the frame 'map'"):
+        intake.admit(fix('odom', 1.0))
+
+
+def altitude(intake, frame_id, second=1):
+    """The altitude of that frame, admitted and processed."""
+    made = intake.admit(Altitude(stamp_ns=second * STAMP, altitude=9.0, frame_id=frame_id))
+    intake.tracker.process(made)
+    return made
+
+
+def test_an_altimeter_in_another_frame_is_turned_where_the_transform_is_known():
+    intake = Intake(built('bathymetry'))
+    assert altitude(intake, 'dvl').altitude == 9.0
+    with pytest.raises(Rejection, match="'altimeter' is not .* and no fixed transform joins"):
+        altitude(intake, 'altimeter')
+    intake.admit(transforms(altimeter=('dvl', shift(0.0, 0.0, 1.5))))
+    made = altitude(intake, 'altimeter')
+    assert made.altitude == 7.5 and made.frame_id == 'dvl'
+
+
+def test_a_late_altitude_does_not_shut_out_the_later_ones():
+    intake = Intake(built('obstacle'))
+    counts = intake.tracker.counts
+    for second in range(5000, 5005):
+        intake.tracker.process(intake.admit(level('map', second * STAMP)))
+    altitude(intake, 'another', 4000)
+    assert counts['too_late'] == 1
+    altitude(intake, 'altimeter', 5005)
+    assert counts['used'] == 6
+    with pytest.raises(Rejection, match="'another' is not the frame 'altimeter'"):
+        altitude(intake, 'another', 5006)
+
+
 def wandering(k, rng):
     """What comes in a second when every sensor has another name, and all it sees too."""
     stamp_ns, place = k * 10**9, np.append(rng.normal(scale=50.0, size=2), -5.0)
     rx = np.column_stack([rng.normal(scale=80.0, size=(4, 2)), np.full(4, -3.0)])
-    pose = Pose(np.zeros(3), np.eye(3))
-    yield StaticTransforms(poses={f'sonar_{k}': ('map', pose)})
+    yield transforms(**{f'sonar_{k}': ('map', shift(0.0))})
     yield evolve(fix('map', place[0]), stamp_ns=stamp_ns, target_id=k, sensor=f'usbl_{k}')
     yield evolve(fix(f'sonar_{k}', place[1]), stamp_ns=stamp_ns)
     yield Fixes(
@@ -211,10 +199,8 @@ def entries(value):
     if attrs.has(type(value)):
         value = attrs.asdict(value, recurse=False)
     if isinstance(value, dict):
-        value = value.values()
-    elif not isinstance(value, (list, tuple, deque)):
-        return 1
-    return sum(map(entries, value))
+        value = list(value.values())
+    return sum(map(entries, value)) if isinstance(value, (list, tuple, deque)) else 1
 
 
 def test_a_tracker_does_not_grow_with_names_that_wander():
@@ -222,8 +208,7 @@ def test_a_tracker_does_not_grow_with_names_that_wander():
     intake = Intake(DiverTracker(DiverConfig(model_set='heading_speed', **parameters)))
     rng, sizes = np.random.default_rng(1), []
     for k in range(1, 61):
-        for item in wandering(k, rng):
-            admitted = intake.admit(item)
+        for admitted in map(intake.admit, wandering(k, rng)):
             if admitted is not None:
                 intake.tracker.process(admitted)
         sizes.append(entries(frozen_state(intake.tracker)))
@@ -252,8 +237,8 @@ def test_a_chain_of_transforms_is_the_product_of_its_matrices():
     rng = np.random.default_rng(3)
     a, b, c, d = (a_pose(rng) for _ in range(4))
     tree = TransformTree()
-    tree.add(StaticTransforms(poses={'base': ('map', a), 'arm': ('base', b)}))
-    tree.add(StaticTransforms(poses={'sonar': ('arm', c), 'keel': ('base', d)}))
+    tree.add(transforms(base=('map', a), arm=('base', b)))
+    tree.add(transforms(sonar=('arm', c), keel=('base', d)))
     A, B, C, D = (matrix(pose) for pose in (a, b, c, d))
     for target, source, expected in (
         ('map', 'sonar', A @ B @ C),
@@ -264,39 +249,37 @@ def test_a_chain_of_transforms_is_the_product_of_its_matrices():
     ):
         assert matrix(tree.pose(target, source)) == pytest.approx(expected, abs=1e-12)
     assert tree.pose('map', 'elsewhere') is None and tree.pose('elsewhere', 'map') is None
-
-
-def test_what_is_said_again_replaces_and_a_loop_ends():
+    # What is said again replaces, and a loop ends.
     tree = TransformTree()
-    near, far = (Pose(np.array([x, 0.0, 0.0]), np.eye(3)) for x in (1.0, 2.0))
-    tree.add(StaticTransforms(poses={'a': ('b', near), 'b': ('a', near)}))
+    tree.add(transforms(a=('b', shift(1.0)), b=('a', shift(1.0))))
     assert tree.pose('nowhere', 'a') is None
-    tree.add(StaticTransforms(poses={'a': ('c', far), 'b': ('c', near)}))
+    tree.add(transforms(a=('c', shift(2.0)), b=('c', shift(1.0))))
     assert tree.pose('c', 'a').position.tolist() == [2.0, 0.0, 0.0]
 
 
 def check_turned(before, after, variance_before, variance_after):
     """Points and covariances, against the homogeneous matrix and the turn of samples."""
-    whole = matrix(TURNED) @ np.append(before, 1.0)
-    assert after == pytest.approx(whole[:3], abs=1e-12)
+    assert after == pytest.approx((matrix(TURNED) @ [*before, 1.0])[:3], abs=1e-12)
     R = np.array([[np.cos(YAW), -np.sin(YAW)], [np.sin(YAW), np.cos(YAW)]])
     assert variance_after == pytest.approx(R @ variance_before @ R.T, abs=1e-12)
 
 
 def test_positions_are_turned_with_their_covariances():
     covariance = np.array([[4.0, 1.0], [1.0, 9.0]])
-    for kind in (Fix, Start):
+    for kind in (Fix, measurements.Start):
         place = kind(stamp_ns=STAMP, position=[1.0, 2.0, 3.0], covariance=covariance, frame_id='a')
         made = moved(place, 'map', TURNED)
         assert made.frame_id == 'map' and made.stamp_ns == STAMP
         check_turned(place.position, made.position, covariance, made.covariance[:2, :2])
-    assert moved(Fix(stamp_ns=1, position=[0.0, 0.0, 0.0]), 'map', TURNED).covariance is None
     whole = np.array([[4.0, 1.0, 0.5], [1.0, 9.0, -0.4], [0.5, -0.4, 0.25]])
-    made = moved(Fix(stamp_ns=1, position=[0.0, 0.0, 0.0], covariance=whole), 'map', TURNED)
-    assert made.covariance == pytest.approx(TURNED.R @ whole @ TURNED.R.T, abs=1e-12)
-    unknown = np.full((2, 2), np.nan)
-    places = [[1.0, 2.0, 3.0], [5.0, 6.0, 0.0]]
-    scan = Fixes(stamp_ns=STAMP, position=places, covariance=np.array([covariance, unknown]))
+    place = evolve(fix('a'), covariance=whole)
+    turned = moved(place, 'map', TURNED).covariance
+    assert turned == pytest.approx(TURNED.R @ whole @ TURNED.R.T, abs=1e-12)
+    assert moved(evolve(place, covariance=None), 'map', TURNED).covariance is None
+    scan = Fixes(
+        stamp_ns=STAMP, position=[[1.0, 2.0, 3.0], [5.0, 6.0, 0.0]],
+        covariance=np.array([covariance, np.full((2, 2), np.nan)]),
+    )  # fmt: skip
     made = moved(scan, 'map', TURNED)
     check_turned(scan.position[0], made.position[0], covariance, made.covariance[0, :2, :2])
     assert np.isnan(made.covariance[1]).all()
@@ -307,19 +290,17 @@ def test_arrivals_are_turned_with_their_bearings():
     more = {'tx': np.ones((2, 3)), 'bearing': seen, 'var_bearing': 0.01}
     ping = arrivals(STAMP, rx, np.full(2, 0.05), **more)
     made = moved(ping, 'map', TURNED)
-    for k in range(2):
-        check_turned(ping.rx[k], made.rx[k], np.eye(2), np.eye(2))
-    assert made.bearing[0] == pytest.approx(3.0 + YAW - 2.0 * np.pi) and np.isnan(made.bearing[1])
+    for before, after in zip(ping.rx, made.rx):
+        check_turned(before, after, np.eye(2), np.eye(2))
+    assert made.bearing == pytest.approx([3.0 + YAW - 2.0 * np.pi, np.nan], nan_ok=True)
 
 
 def test_navigation_is_turned_as_its_pose_is():
     rng = np.random.default_rng(1)
-    root = rng.normal(size=(6, 6))
-    quaternion = rng.normal(size=4)
-    navigation = Navigation(
-        stamp_ns=STAMP, position=[1.0, 2.0, 3.0], velocity=[1.0, 0.5, 0.1], frame_id='odom',
-        orientation=quaternion / np.linalg.norm(quaternion), pose_covariance=root @ root.T,
-    )  # fmt: skip
+    root, quaternion = rng.normal(size=(6, 6)), rng.normal(size=4)
+    turn = {'orientation': quaternion / np.linalg.norm(quaternion), 'velocity': [1.0, 0.5, 0.1]}
+    place = {'position': [1.0, 2.0, 3.0], 'pose_covariance': root @ root.T, 'frame_id': 'odom'}
+    navigation = Navigation(stamp_ns=STAMP, **place, **turn)
     made = moved(navigation, 'map', TURNED)
     before = geometry.rotation_of_quaternion(navigation.orientation)
     after = geometry.rotation_of_quaternion(made.orientation)
@@ -333,9 +314,8 @@ def test_navigation_is_turned_as_its_pose_is():
 
 def test_a_tilted_frame_and_what_a_sonar_sees_are_refused_with_both_names():
     tilted = Pose(np.zeros(3), geometry.rotation(0.1, 0.0, 0.0))
-    placed = Fix(stamp_ns=STAMP, position=[0.0, 0.0, 0.0], frame_id='deck')
     with pytest.raises(Rejection, match="'deck' is tilted against 'map'"):
-        moved(placed, 'map', tilted)
+        moved(fix('deck'), 'map', tilted)
     ping = Detections(stamp_ns=STAMP, range=[1.0], bearing=[0.0], frame_id='sonar')
     with pytest.raises(Rejection, match="'sonar'"):
         moved(ping, 'map', TURNED)
@@ -343,8 +323,7 @@ def test_a_tilted_frame_and_what_a_sonar_sees_are_refused_with_both_names():
 
 def test_what_sensors_on_board_measure_is_turned_into_the_axes_of_the_first_one():
     echo = Detections(stamp_ns=STAMP, range=[5.0], bearing=[3.0], frame_id='skewed')
-    here = Pose(np.zeros(3), TURNED.R)
-    made = moved(echo, 'sonar', here)
+    made = moved(echo, 'sonar', Pose(np.zeros(3), TURNED.R))
     assert made.frame_id == 'sonar' and made.range.tolist() == [5.0]
     assert made.bearing == pytest.approx([3.0 + YAW - 2.0 * np.pi])
     with pytest.raises(Rejection, match="'skewed' is another one, at another place"):
@@ -356,13 +335,11 @@ def test_what_sensors_on_board_measure_is_turned_into_the_axes_of_the_first_one(
 
     tilted = Pose(np.array([2.0, 0.5, -1.0]), geometry.rotation(0.3, -0.4, 0.9))
     covariance = np.diag([1.0, 4.0, 9.0])
-    placed = RelativeFix(
-        stamp_ns=STAMP, offset=[9.0, 2.0, -4.0], covariance=covariance, frame_id='b'
-    )
-    made = moved(placed, 'usbl', tilted)
+    there = {'stamp_ns': STAMP, 'offset': [9.0, 2.0, -4.0], 'frame_id': 'b'}
+    made = moved(measurements.RelativeFix(covariance=covariance, **there), 'usbl', tilted)
     assert made.offset == pytest.approx((matrix(tilted) @ [9.0, 2.0, -4.0, 1.0])[:3])
     assert made.covariance == pytest.approx(tilted.R @ covariance @ tilted.R.T)
-    level = RelativeFix(stamp_ns=STAMP, offset=[9.0, 2.0, -4.0], levelled=True, frame_id='b')
+    level = measurements.RelativeFix(levelled=True, **there)
     made = moved(level, 'usbl', Pose(np.zeros(3), tilted.R))
     assert made.offset.tolist() == [9.0, 2.0, -4.0] and made.frame_id == 'usbl'
     with pytest.raises(Rejection, match='do not say how the vessel lies'):
@@ -370,11 +347,11 @@ def test_what_sensors_on_board_measure_is_turned_into_the_axes_of_the_first_one(
 
 
 def test_frames_whose_names_wander_are_forgotten_and_those_said_again_are_not():
-    tree, step = TransformTree(), Pose(np.ones(3), np.eye(3))
+    tree, step = TransformTree(), shift(1.0, 1.0, 1.0)
     for k in range(3 * MOST_FRAMES):
-        tree.add(StaticTransforms(stamp_ns=STAMP, poses={f'f{k}': (f'f{k - 1}', step)}))
+        tree.add(transforms(STAMP, **{f'f{k}': (f'f{k - 1}', step)}))
         if k % 100 == 0:
-            tree.add(StaticTransforms(stamp_ns=STAMP, poses={'sonar': ('hull', step)}))
+            tree.add(transforms(STAMP, sonar=('hull', step)))
     assert len(tree._poses) == MOST_FRAMES
     assert tree.pose('hull', 'sonar') is not None
     assert tree.pose('f0', 'f1') is None
@@ -384,48 +361,28 @@ def test_frames_whose_names_wander_are_forgotten_and_those_said_again_are_not():
 # One frame for one tracker.
 
 
-def placed(frame_id):
-    return Fix(stamp_ns=1, position=(0.0, 0.0, 0.0), frame_id=frame_id)
-
-
-def test_the_first_named_frame_stays():
-    frames = KnownFrames()
-    frames.admit(placed(''))
-    frames.admit(placed('map'))
-    frames.admit(placed('map'))
+def test_the_first_named_frame_stays_and_a_required_one_holds_before_any_is_known():
+    frames, of_tracks = KnownFrames(), measurements.ArrayDepth
+    for frame_id in ('map', ''):
+        with pytest.raises(Rejection, match=f"'{frame_id}' is not the frame 'harbour' of the tr"):
+            frames.check(fix(frame_id), 'harbour')
+    frames.check(fix('harbour'), 'harbour')
+    frames.check(Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter'), 'harbour')
+    assert frames.frame_id == ''
+    for frame_id in ('', 'map', 'map'):
+        frames.admit(fix(frame_id))
     with pytest.raises(Rejection) as caught:
-        frames.admit(placed('odom'))
-    assert caught.value.reason == 'frame'
+        frames.admit(fix('odom'))
     assert caught.value.sentence == "the frame 'odom' is not the frame 'map' of the tracks"
-    with pytest.raises(Rejection):
-        frames.admit(placed(''))
-    # A depth is one in any frame.
-    frames.admit(ArrayDepth(stamp_ns=1, depth=30.0, frame_id='buoy'))
+    assert caught.value.reason == reason(frames.admit, fix('')) == 'frame'
+    frames.admit(of_tracks(stamp_ns=1, depth=30.0, frame_id='buoy'))  # one in any frame
     assert frames.frame_id == 'map'
 
 
-def test_a_required_frame_holds_before_any_is_known():
-    frames = KnownFrames()
-    with pytest.raises(Rejection, match="'map' is not the frame 'harbour' of the tracks"):
-        frames.check(placed('map'), 'harbour')
-    with pytest.raises(Rejection, match="'' is not the frame 'harbour' of the tracks"):
-        frames.check(placed(''), 'harbour')
-    frames.check(placed('harbour'), 'harbour')
-    frames.check(Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter'), 'harbour')
-    assert frames.frame_id == ''
-
-
 def test_what_sensors_on_board_say_is_in_frames_of_their_own():
-    frames = KnownFrames()
-    echo = Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar')
+    frames, nothing = KnownFrames(), {'stamp_ns': 1, 'range': [], 'bearing': []}
     height = Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter')
-    place = Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='odom')
-    for measurement in (echo, height, place, echo, height, place):
+    for measurement in (Detections(frame_id='sonar', **nothing), height, level('odom')) * 2:
         frames.admit(measurement)
-    for other in (
-        Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'),
-        Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='map'),
-    ):
-        with pytest.raises(Rejection) as caught:
-            frames.admit(other)
-        assert caught.value.reason == 'frame'
+    for other in (Detections(frame_id='sonar_2', **nothing), level('map')):
+        assert reason(frames.admit, other) == 'frame'

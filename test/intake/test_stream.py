@@ -18,6 +18,7 @@ from sonar_imm import measurements
 from sonar_imm.intake import RepeatFilter
 from sonar_imm.intake.leaps import LeapFilter
 from sonar_imm.intake.stream import Admitted, OnceStream, ReplayStream, StreamRules
+from sonar_imm.measurements import Fix, Fixes, GeodeticFix, Navigation, Rejection, RelativeFix
 from sonar_imm.trackers.shared_parameters import StampParameters, StreamParameters
 
 S = 10**9
@@ -52,14 +53,17 @@ def once(window_ns=0):
     return OnceStream((Number,), StreamRules(window_ns, 600 * S, 3))
 
 
-@pytest.mark.parametrize('make, take', [(replay, 'revise'), (once, 'admit')])
+STREAMS = pytest.mark.parametrize('make, take', [(replay, 'revise'), (once, 'admit')])
+
+
+@STREAMS
 def test_strangers_and_other_frames_are_counted(make, take):
-    stream = make()
+    stream, nothing = make(), Admitted() if take == 'admit' else []
+    take = getattr(stream, take)
     assert stream.frame_id == ''
-    getattr(stream, take)(Number(S))
-    nothing = Admitted() if take == 'admit' else []
-    assert getattr(stream, take)('a word') == nothing
-    assert getattr(stream, take)(Number(2 * S, frame_id='odom')) == nothing
+    take(Number(S))
+    assert take('a word') == nothing
+    assert take(Number(2 * S, frame_id='odom')) == nothing
     assert stream.counts['unknown_type'] == stream.counts['other_frame'] == 1
     assert stream.frame_id == 'map'
 
@@ -88,12 +92,9 @@ def test_a_restart_keeps_what_survives_and_hands_everything_out():
 def test_a_stream_without_history_takes_each_stamp_once_and_in_order():
     stream = once()
     assert stream.admit(Number(5 * S)).items == (Number(5 * S),)
-    assert stream.admit(Number(5 * S, 1)) == Admitted()
-    assert stream.admit(Number(4 * S)) == Admitted()
+    assert stream.admit(Number(5 * S, 1)) == stream.admit(Number(4 * S)) == Admitted()
     assert stream.counts == {'duplicate': 1, 'too_late': 1, 'doubted': 0}
-
-
-def test_a_restart_without_history_is_in_order_too():
+    # Also after a restart.
     stream = once(window_ns=S)
     for number in at(5000, 5001):
         stream.admit(number)
@@ -117,27 +118,25 @@ class Echo(Number):
     FRAME = 'own'
 
 
-@pytest.mark.parametrize('make, take', [(replay, 'revise'), (once, 'admit')])
+@STREAMS
 def test_only_what_is_used_decides_on_the_frame_of_a_sensor(make, take):
-    stream = make()
-    stream.accepts = (Number, Echo)
+    stream, nothing = make(), ([], Admitted())
+    stream.accepts, take = (Number, Echo), getattr(stream, take)
     for second in range(5000, 5010):
-        getattr(stream, take)(Number(second * S))
-    getattr(stream, take)(Echo(4000 * S, frame_id='bow_1'))  # late
-    getattr(stream, take)(Echo(9000 * S, frame_id='bow_2'))  # ahead of its time
-    assert getattr(stream, take)(Echo(5010 * S, frame_id='bow')) not in ([], Admitted())
+        take(Number(second * S))
+    take(Echo(4000 * S, frame_id='bow_1'))  # late
+    take(Echo(9000 * S, frame_id='bow_2'))  # ahead of its time
+    assert take(Echo(5010 * S, frame_id='bow')) not in nothing
     assert stream.counts['too_late'] == 1 and not stream.counts['other_frame']
-    assert getattr(stream, take)(Echo(5011 * S, frame_id='stern')) in ([], Admitted())
+    assert take(Echo(5011 * S, frame_id='stern')) in nothing
     assert stream.counts['other_frame'] == 1
 
 
 def test_what_was_held_is_in_one_frame_after_a_restart():
     stream = once()
     stream.accepts = (Number, Echo)
-    for number in at(5000, 5001):
-        stream.admit(number)
-    for second, frame in ((10, 'bow'), (11, 'stern')):
-        stream.admit(Echo(second * S, frame_id=frame))
+    for item in (*at(5000, 5001), Echo(10 * S, frame_id='bow'), Echo(11 * S, frame_id='stern')):
+        stream.admit(item)
     admitted = stream.admit(Echo(12 * S, frame_id='bow'))
     assert [number.stamp_ns for number in admitted.items] == [10 * S, 12 * S]
     assert stream.counts['other_frame'] == 1
@@ -148,18 +147,22 @@ def test_what_was_held_is_in_one_frame_after_a_restart():
 
 def fix(second, x=1.0, **values):
     values = {'frame_id': 'map', **values}
-    return measurements.Fix(stamp_ns=round(second * S), position=(x, 0.0, 0.0), **values)
+    return Fix(stamp_ns=round(second * S), position=(x, 0.0, 0.0), **values)
 
 
 def scan(second, *places, **values):
     position = np.reshape([(x, 0.0, 0.0) for x in places], (-1, 3))
-    return measurements.Fixes(stamp_ns=round(second * S), position=position, **values)
+    return Fixes(stamp_ns=round(second * S), position=position, **values)
+
+
+def on_earth(second, longitude=10.0, kind=GeodeticFix, **values):
+    return kind(stamp_ns=round(second * S), **{'latitude': 59.0, **values}, longitude=longitude)
 
 
 def passes(repeats, measurement):
     try:
         repeats.fresh(measurement)
-    except measurements.Rejection as rejection:
+    except Rejection as rejection:
         assert rejection.reason == 'repeated'
         return False
     return True
@@ -181,25 +184,14 @@ def test_other_numbers_names_sensors_and_frames_are_no_repeats():
     assert all(passes(repeats, fix(2, **{name: value})) for name, value in others.items())
 
 
-@pytest.mark.parametrize(
-    'make',
-    [
-        lambda k: measurements.GeodeticFix(stamp_ns=k * S, latitude=59.0, longitude=10.0),
-        lambda k: measurements.RelativeFix(stamp_ns=k * S, offset=(1.0, 2.0, 3.0)),
-        lambda k: scan(k, 1.0, 2.0),
-    ],
-)
-def test_all_kinds_of_positions(make):
-    repeats = RepeatFilter(5.0)
-    assert passes(repeats, make(1)) and not passes(repeats, make(2))
-
-
-def test_an_empty_scan_and_a_vessel_at_rest_are_no_repeats():
-    repeats = RepeatFilter(5.0)
+def test_all_kinds_of_positions_but_an_empty_scan_and_a_vessel_at_rest():
+    repeats, places = RepeatFilter(5.0), {'offset': (1.0, 2.0, 3.0)}
     for k in range(1, 4):
-        assert passes(repeats, scan(k))
-        assert passes(
-            repeats, measurements.VesselFix(stamp_ns=k * S, latitude=59.0, longitude=10.0)
+        assert passes(repeats, on_earth(k)) == (k == 1)
+        assert passes(repeats, RelativeFix(stamp_ns=k * S, **places)) == (k == 1)
+        assert passes(repeats, scan(k, 1.0, 2.0)) == (k == 1)
+        assert passes(repeats, scan(k)) and passes(
+            repeats, on_earth(k, kind=measurements.VesselFix)
         )
 
 
@@ -222,27 +214,25 @@ def held(count, period, std, digits, seed=1, speed=0.4):
         if new:
             place = np.round((speed * k, 3.0) + std * rng.normal(size=2), digits)
         known = {'position': (*place, 0.0), 'covariance': std**2 * np.eye(2)}
-        yield measurements.Fix(stamp_ns=(1 + k) * S, **known), new
+        yield Fix(stamp_ns=(1 + k) * S, **known), new
 
 
 @pytest.mark.parametrize('period', [2, 7, 10, 12])
-@pytest.mark.parametrize('speed', [0.0, 0.4, 5.0])
-def test_a_value_that_is_held_counts_once(period, speed):
-    repeats = RepeatFilter(5.0)
-    found = [(passes(repeats, item), new) for item, new in held(200, period, 1.5, 3, speed=speed)]
-    # Of the first value it cannot be known.
-    assert all(used == new for used, new in found[period:])
-    assert sum(used for used, _ in found[:period]) <= 1 + (period > 6)
+def test_a_value_that_is_held_counts_once(period):
+    for speed in (0.0, 0.4, 5.0):
+        repeats, values = RepeatFilter(5.0), held(200, period, 1.5, 3, speed=speed)
+        found = [(passes(repeats, item), new) for item, new in values]
+        # Of the first value it cannot be known.
+        assert all(used == new for used, new in found[period:])
+        assert sum(used for used, _ in found[:period]) <= 1 + (period > 6)
 
 
 def test_named_rows_and_latitudes_are_held_too():
     repeats, geodetic = RepeatFilter(5.0), RepeatFilter(5.0)
     for k, (item, new) in enumerate(held(60, 10, 1.5, 3)):
         x, y = item.position[:2].tolist()
-        both = scan(1 + k, x, float(k), target_id=[4, 5])
-        rows = repeats.fresh(both).target_id.tolist()
-        degrees = {'latitude': 59.0 + 1e-5 * x, 'longitude': 10.0 + 1e-5 * y}
-        used = passes(geodetic, measurements.GeodeticFix(stamp_ns=(1 + k) * S, **degrees))
+        rows = repeats.fresh(scan(1 + k, x, float(k), target_id=[4, 5])).target_id.tolist()
+        used = passes(geodetic, on_earth(1 + k, 10.0 + 1e-5 * y, latitude=59.0 + 1e-5 * x))
         assert k < 10 or (used == new and rows == ([4, 5] if new else [5]))
 
 
@@ -262,24 +252,18 @@ def test_a_frozen_value_of_fine_digits_is_no_fix_however_old():
 )
 def test_a_degree_of_longitude_is_short_in_the_north(latitude, std, fine):
     """Steps of 0.19 m are fine digits beside a deviation of 0.9 m, those of 1.1 m are coarse."""
-    repeats, degrees = RepeatFilter(5.0), {'latitude': latitude, 'covariance': std**2 * np.eye(3)}
-
-    def at(k, longitude):
-        return measurements.GeodeticFix(stamp_ns=(1 + k) * S, longitude=longitude, **degrees)
-
+    repeats, place = RepeatFilter(5.0), {'latitude': latitude, 'covariance': std**2 * np.eye(3)}
     for k in range(60):
-        passes(repeats, at(k, 10.0 + 1e-5 * (k // 5)))
-    frozen = [passes(repeats, at(60 + k, 10.0 + 11e-5)) for k in range(60)]
+        passes(repeats, on_earth(1 + k, 10.0 + 1e-5 * (k // 5), **place))
+    frozen = [passes(repeats, on_earth(61 + k, 10.0 + 11e-5, **place)) for k in range(60)]
     assert any(frozen) != fine
 
 
 def test_a_value_that_came_once_each_is_not_held():
     """A vehicle of a simulator without noise that stops: its fixes count after a while."""
     repeats = RepeatFilter(5.0)
-    for k in range(30):
-        assert passes(repeats, fix(1 + k, x=0.1 * k))
-    rest = [passes(repeats, fix(31 + k, x=5.0)) for k in range(30)]
-    assert sum(rest) == 5
+    assert all(passes(repeats, fix(1 + k, x=0.1 * k)) for k in range(30))
+    assert sum(passes(repeats, fix(31 + k, x=5.0)) for k in range(30)) == 5
 
 
 def test_zero_lets_everything_pass_and_memory_is_bounded():
@@ -289,13 +273,11 @@ def test_zero_lets_everything_pass_and_memory_is_bounded():
     for k in range(10_500):
         repeats.fresh(fix(1, x=float(k)))
     assert len(repeats._first) == 10_000
-
-
-def test_what_is_remembered_of_a_scan_is_as_short_as_of_a_position():
-    repeats = RepeatFilter(5.0)
+    # What is remembered of a scan is as short as of a position.
+    repeats, rows = RepeatFilter(5.0), 1e-3 * np.arange(1000)
     for k in range(1, 100):
-        assert passes(repeats, scan(k, *(k + 1e-3 * np.arange(1000)), frame_id='f' * 1000))
-    assert not passes(repeats, scan(101, *(99 + 1e-3 * np.arange(1000)), frame_id='f' * 1000))
+        assert passes(repeats, scan(k, *(k + rows), frame_id='f' * 1000))
+    assert not passes(repeats, scan(101, *(99 + rows), frame_id='f' * 1000))
     assert len(pickle.dumps(repeats)) < 10_000
 
 
@@ -307,41 +289,32 @@ def believed(positions, kind='metres', period=0.5, filter=None):
     filter = filter or LeapFilter()
     found = []
     for k, (x, y) in enumerate(positions):
-        stamp_ns = 1000 * S + round(k * period * S)
+        stamp = 1000.0 + k * period
         if kind == 'earth':
-            place = {'latitude': y, 'longitude': x, 'height': 0.0, 'frame_id': 'gps'}
-            measured = measurements.VesselFix(stamp_ns=stamp_ns, **place)
+            facts = {'latitude': y, 'height': 0.0, 'frame_id': 'gps'}
+            measured = on_earth(stamp, x, measurements.VesselFix, **facts)
         else:
             place = {'position': (x, y, 0.0), 'orientation': (0.0, 0.0, 0.0, 1.0)}
-            measured = measurements.Navigation(stamp_ns=stamp_ns, frame_id='odom', **place)
+            measured = Navigation(stamp_ns=round(stamp * S), frame_id='odom', **place)
         try:
             filter.check(measured)
             found.append(True)
-        except measurements.Rejection as refusal:
+        except Rejection as refusal:
             assert refusal.reason == 'leap'
             found.append(False)
     return found
 
 
-@pytest.mark.parametrize('far', [1200.0, 4e4, 5e6])
-def test_a_leap_of_a_moment_is_refused(far):
-    way = [(2.0 * k, 0.0) for k in range(10)]
-    way[4] = (8.0, far)
-    assert believed(way) == [k != 4 for k in range(10)]
-
-
-def test_a_vessel_that_stays_where_it_leapt_is_believed_after_two_seconds():
+def test_a_leap_of_a_moment_is_refused():
+    for far in (1200.0, 4e4, 5e6):
+        way = [(2.0 * k, far * (k == 4)) for k in range(10)]
+        assert believed(way) == [k != 4 for k in range(10)]
+    # One that stays is believed after two seconds; of two vessels in turn one is refused.
     way = [(0.0, 0.0)] * 3 + [(9e4, 0.5 * k) for k in range(10)]
     assert believed(way) == [True] * 3 + [False] * 4 + [True] * 6
     assert believed(way, period=2.0) == [True] * 3 + [False] * 2 + [True] * 8
-
-
-def test_two_vessels_in_turn_are_one_and_the_other_refused():
-    way = [(0.0, 0.0), (5e5, 0.0)] * 10
-    assert believed(way) == [True, False] * 10
-
-
-def test_fast_enough_is_no_leap():
+    assert believed([(0.0, 0.0), (5e5, 0.0)] * 10) == [True, False] * 10
+    # Fast enough is no leap.
     assert all(believed([(95.0 * k, 0.0) for k in range(50)], period=1.0))
     assert all(believed([(0.0, 0.0), (80e3, 0.0)], period=1000.0))
 
@@ -358,6 +331,6 @@ def test_vessels_in_other_frames_and_targets_are_not_asked():
     assert believed([(0.0, 0.0)], filter=filter) == [True]
     assert believed([(9.0, 54.0)], 'earth', filter=filter) == [True]
     for x in (0.0, 1e6):
-        filter.check(measurements.Fix(stamp_ns=1000 * S, position=(x, 0.0, 0.0), frame_id='odom'))
+        filter.check(fix(1000, x, frame_id='odom'))
     filter.reset()
     assert believed([(1e6, 0.0)], filter=filter) == [True]

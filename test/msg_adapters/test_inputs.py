@@ -13,15 +13,20 @@ import subprocess
 import sys
 from typing import get_args
 
+import attrs
+from helpers.hostile.properties import check_refusal
+from helpers.hostile.runs import mutated, MUTATIONS
+from helpers.hostile.streams import templates
 from helpers.marine import driver_message, OTHERS
 import numpy as np
 import pytest
 
 import msg_adapters
-from msg_adapters.inputs import inputs_of
+from msg_adapters.inputs import inputs_of, made_inputs
 from msg_adapters.inputs.topic import Labels, tag_numbers
 import sonar_imm
-from sonar_imm.measurements import Fix, Fixes, Measurement, NOBODY, Rejection
+from sonar_imm import measurements
+from sonar_imm.measurements import Arrivals, Fix, Fixes, NOBODY, Rejection
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.recordings.messages import ros_message, typestore
 
@@ -29,20 +34,65 @@ FOREIGN = ('marine_acoustic_msgs/', 'stonefish_ros2/', 'dave_interfaces/')
 
 
 def test_every_tracker_has_inputs_whose_readers_say_no_politely():
-    for system in SYSTEMS:
-        for topic in inputs_of(system):
-            assert topic.description and not topic.name.startswith('/')
-            for name, read in topic.readers.items():
-                if name.startswith(FOREIGN):  # see test_detections.py, test_navigation.py
-                    continue
-                if name in OTHERS:
-                    empty = driver_message(name)
-                else:
-                    assert name in typestore().types
-                    empty = ros_message(name)
-                with pytest.raises(Rejection):  # an empty message has no stamp
-                    read(empty)
-                assert topic.doubt(empty, ()) in (None, 'zero_covariance', 'no_frame')
+    topics = [topic for system in SYSTEMS for topic in inputs_of(system)]
+    assert all(topic.description and not topic.name.startswith('/') for topic in topics)
+    for topic, (name, read) in ((each, item) for each in topics for item in each.readers.items()):
+        if name.startswith(FOREIGN):  # see test_detections.py, test_navigation.py
+            continue
+        assert name in OTHERS or name in typestore().types
+        empty = driver_message(name) if name in OTHERS else ros_message(name)
+        with pytest.raises(Rejection):  # an empty message has no stamp
+            read(empty)
+        assert topic.doubt(empty, ()) in (None, 'zero_covariance', 'no_frame')
+
+
+FINITE = (
+    'altitude frequency iq latitude longitude offset orientation position range rx toa'.split()
+)
+"""What is known where there is a measurement at all."""
+
+
+def check_measurement(item):
+    """Numbers that are finite, variances above zero or unknown, blocks of them that are some."""
+    values = attrs.asdict(item, recurse=False)
+    if isinstance(item, measurements.Snapshot):
+        values['iq'] = item.iq[item.usable]
+    if isinstance(item, measurements.Start):
+        values['position'] = item.position[:2]
+    for name, value in values.items():
+        known = np.ravel(value)
+        assert name not in FINITE or value is None or np.isfinite(known).all(), name
+        if name.startswith('var_') or name.endswith('_variance'):
+            assert value is None or (known[~np.isnan(known)] > 0.0).all(), name
+    if isinstance(item, measurements.Detections):
+        assert np.isfinite(item.bearing).all() and (item.range > 0.0).all()
+    if isinstance(item, Arrivals):
+        bearing = item.bearing[~np.isnan(item.bearing)]
+        assert len(item) and (np.abs(bearing) <= np.pi).all()
+        assert item.passive or np.isfinite(item.tx).all()
+    if isinstance(item, (Fix, Fixes)) and item.covariance is not None:
+        whole = item.covariance.reshape(-1, 3, 3)
+        for C in (*whole, *whole[:, :2, :2]):
+            known = C[~np.isnan(np.diag(C))][:, ~np.isnan(np.diag(C))]
+            assert np.isnan(C).sum() == C.size - known.size and np.isfinite(known).all()
+            assert not known.size or np.linalg.eigvalsh(known / known.max()).min() > 0.0
+
+
+@pytest.mark.parametrize('system', SYSTEMS)
+def test_hostile_messages_are_refused_or_sound(system):
+    entries = {entry.name: entry for entry in (*inputs_of(system), *made_inputs(system))}
+    rng, given, read = np.random.default_rng(7), templates(system), 0
+    for k in range(120 * len(given)):
+        name, type_name, message = given[k % len(given)]
+        message = mutated(message, MUTATIONS[rng.integers(len(MUTATIONS))], rng)
+        try:
+            item = entries[name].reader(type_name, ('enu', 'ned')[k % 2], {})(message)
+        except Rejection as rejection:
+            check_refusal(rejection)
+            continue
+        check_measurement(item)
+        read += 1
+    assert read > 48 * len(given)
 
 
 def test_the_adapters_load_neither_rclpy_nor_rosbags():
@@ -64,7 +114,7 @@ def test_each_class_of_measurements_is_heard_under_one_name():
         first = names.setdefault(entry.measurement, entry.name)
         assert '/' not in first and entry.name.split('/')[-1] == first
     received = {item for entry in entries for item in entry.measurements}
-    assert received == set(get_args(Measurement))
+    assert received == set(get_args(measurements.Measurement))
 
 
 # -- Names of tags and sensors, from topics and frames --
@@ -108,9 +158,7 @@ def test_sensors_are_labelled_and_scans_are_no_tags():
     assert labels(scan).sensor == 'radar'
     assert label('/radar/fix', fix(), sensors=['radar']).sensor == 'radar'
     assert Labels.of('/bob/fix', {'tags': [], 'sensors': []}, BOTH) is None
-
-
-def test_each_name_has_a_topic_of_its_own():
+    # Each name has a topic of its own.
     by_name = {entry.name: entry for entry in inputs_of('diver')}
     settings = {'tags': ['amy'], 'sensors': ['radar']}
     assert by_name['fix'].instances(settings) == ('fix', 'amy/fix', 'radar/fix')

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from msg_adapters.inputs import inputs_of
 from msg_adapters.navigation import (
     doubt_navigation,
-    read_dave_dvl,
     read_dvl,
     read_navigation,
     read_range,
@@ -31,7 +30,7 @@ from msg_adapters.transforms import read_transforms, write_transforms
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Altitude, Navigation, StaticTransforms
-from sonar_imm_tools.recordings.messages import ros_message, typestore
+from sonar_imm_tools.recordings.messages import ros_message
 
 TURNED = Rotation.from_euler('ZYX', [0.7, -0.2, 0.4])
 
@@ -54,9 +53,8 @@ def test_writing_and_reading_gives_the_same_navigation():
     covariance[0, 1] = covariance[1, 0] = 0.5
     item = navigation(pose_covariance=covariance)
     again = read_navigation(write_navigation(item, ros_message))
-    for name in ('stamp_ns', 'frame_id', 'child_frame_id'):
-        assert getattr(again, name) == getattr(item, name)
-    for name in ('position', 'orientation', 'velocity', 'turn_rate', 'pose_covariance'):
+    ids = ('stamp_ns', 'frame_id', 'child_frame_id')
+    for name in (*ids, 'position', 'orientation', 'velocity', 'turn_rate', 'pose_covariance'):
         assert np.array_equal(getattr(again, name), getattr(item, name))
     assert again.twist_covariance is None
 
@@ -69,13 +67,10 @@ def test_a_twist_in_world_axes_is_turned_into_the_vehicle():
         assert turned.velocity == pytest.approx(child * flip)
         assert turned.turn_rate == pytest.approx(rate * flip)
     assert read_navigation(stated).velocity != pytest.approx(child)
-
-
-@pytest.mark.parametrize('diagonal', [0.0, -1.0, np.nan])
-def test_covariances_that_say_nothing_are_unknown(diagonal):
-    message = odometry()
-    message.pose.covariance[:] = np.diag(np.full(6, diagonal)).ravel()
-    assert read_navigation(message).pose_covariance is None
+    # A covariance that says nothing is unknown.
+    for diagonal in (0.0, -1.0, np.nan):
+        stated.pose.covariance[:] = np.diag(np.full(6, diagonal)).ravel()
+        assert read_navigation(stated).pose_covariance is None
 
 
 def test_a_ned_frame_is_taken_only_when_it_is_expected_and_a_missing_one_doubted():
@@ -100,11 +95,9 @@ def test_an_frd_vehicle_in_ned_becomes_an_flu_vehicle_in_enu():
         R = Rotation.random(random_state=random)
         root = random.normal(size=(2, 6, 6))
         pose, twist = root @ np.swapaxes(root, 1, 2)
-        stated = navigation(
-            orientation=R.as_quat(), position=random.normal(size=3),
-            velocity=random.normal(size=3), turn_rate=random.normal(size=3), pose_covariance=pose,
-            twist_covariance=twist, child_frame_id='base_link_frd',
-        )  # fmt: skip
+        ways = {n: random.normal(size=3) for n in ('position', 'velocity', 'turn_rate')}
+        known = {'pose_covariance': pose, 'twist_covariance': twist, **ways}
+        stated = navigation(orientation=R.as_quat(), child_frame_id='base_link_frd', **known)
         turned = read_navigation(write_navigation(stated, ros_message), world_frame='ned')
         expected = W @ R.as_matrix() @ B
         assert np.allclose(Rotation.from_quat(turned.orientation).as_matrix(), expected)
@@ -117,40 +110,32 @@ def test_an_frd_vehicle_in_ned_becomes_an_flu_vehicle_in_enu():
         assert turned.child_frame_id == 'base_link'
 
 
-@pytest.mark.parametrize(
-    'name, values, code',
-    [
+@pytest.mark.filterwarnings('error')
+def test_a_pose_that_cannot_be_used_is_refused():
+    for name, values, code in (
         ('orientation', [0.0, 0.0, 0.0, 0.0], 'bad_orientation'),
         ('orientation', [0.0, 0.0, 0.0, 1.0105], 'bad_orientation'),
-        ('orientation', [0.0, 0.0, 0.0, 2.0], 'bad_orientation'),
         ('orientation', [0.0, 1e300, 0.0, 1e300], 'bad_orientation'),
         ('orientation', [0.0, np.nan, 0.0, 1.0], 'nan'),
         ('position', [0.0, 0.0, np.inf], 'nan'),
         ('position', [0.0, 2e8, 0.0], 'out_of_range'),
-    ],
-)
-@pytest.mark.filterwarnings('error')
-def test_a_pose_that_cannot_be_used_is_refused(name, values, code):
-    places = {f'pose__pose__{name}__{axis}': value for axis, value in zip('xyzw', values)}
-    assert reason(read_navigation, marine.put(odometry(), **places)) == code
+    ):
+        places = {f'pose__pose__{name}__{axis}': value for axis, value in zip('xyzw', values)}
+        assert reason(read_navigation, marine.put(odometry(), **places)) == code
 
 
-def test_an_altitude_is_written_and_read():
+def test_an_altitude_is_written_and_read_and_one_out_of_limits_refused():
     for variance in (0.25, np.nan):
         item = Altitude(stamp_ns=12, altitude=15.5, variance=variance, frame_id='altimeter')
-        again = read_range(write_range(item, ros_message))
+        message = write_range(item, ros_message)
+        again = read_range(message)
         assert (again.stamp_ns, again.altitude, again.frame_id) == (12, 15.5, 'altimeter')
         assert np.array_equal(again.variance, variance, equal_nan=True)
-
-
-@pytest.mark.parametrize(
-    'code, heights', [('nan', (np.inf, -np.inf, np.nan)), ('out_of_range', (60.0, 0.2))]
-)
-def test_an_altitude_out_of_limits_is_refused(code, heights):
-    message = write_range(Altitude(stamp_ns=12, altitude=15.5), ros_message)
-    for height in heights:
-        message.min_range, message.max_range, message.range = 0.5, 50.0, height
-        assert reason(read_range, message) == code
+    message.min_range, message.max_range = 0.5, 50.0
+    for code, heights in (('nan', (np.inf, -np.inf, np.nan)), ('out_of_range', (60.0, 0.2))):
+        for height in heights:
+            message.range = height
+            assert reason(read_range, message) == code
 
 
 def plain(altitude):
@@ -159,24 +144,20 @@ def plain(altitude):
 
 
 def stonefish(altitude):
-    return marine.driver_message(
-        'stonefish_ros2/msg/DVL', header=marine.header(), altitude=altitude
-    )
+    values = {'header': marine.header(), 'altitude': altitude}
+    return marine.driver_message('stonefish_ros2/msg/DVL', **values)
 
 
 def dave(distance, target='bottom'):
-    return marine.driver_message(
-        'dave_interfaces/msg/DVL', header=marine.header(), target__type=target,
-        target__range=distance,
-    )  # fmt: skip
+    values = {'header': marine.header(), 'target__type': target, 'target__range': distance}
+    return marine.driver_message('dave_interfaces/msg/DVL', **values)
 
 
 @pytest.mark.parametrize('make', [plain, stonefish, dave])
 def test_the_altitude_of_a_doppler_log_needs_bottom_lock(make):
-    if make is plain:
-        read, message = read_dvl, plain(7.25)
-    else:
-        message = marine.sent(make(7.25))
+    read, message = read_dvl, make(7.25)
+    if make is not plain:
+        message = marine.sent(message)
         (entry,) = (entry for entry in inputs_of('obstacle') if entry.name == 'altitude')
         read = entry.reader(message.__msgtype__, 'enu', {})
     found = read(message)
@@ -184,10 +165,8 @@ def test_the_altitude_of_a_doppler_log_needs_bottom_lock(make):
     assert np.isnan(found.variance)
     assert reason(read, make(0.0)) == reason(read, make(-1.0)) == 'no_bottom'
     assert reason(read, make(np.nan)) == 'nan' and reason(read, make(2e4)) == 'out_of_range'
-
-
-def test_a_log_that_tracks_the_water_knows_no_altitude():
-    assert reason(read_dave_dvl, dave(30.0, 'DVL_TARGET_WATER_MASS')) == 'no_bottom'
+    if make is dave:  # one that tracks the water knows no altitude
+        assert reason(read, dave(30.0, 'DVL_TARGET_WATER_MASS')) == 'no_bottom'
 
 
 # -- Transforms as messages: TFMessage of a recording, TransformStamped where tf2 is missing --
@@ -202,24 +181,18 @@ def test_what_is_written_reads_back():
     rng = np.random.default_rng(0)
     for _ in range(20):
         rpy = rng.uniform(-np.pi, np.pi, size=3) * [1.0, 0.5, 1.0]
-        made = message(rpy=rpy)
-        name = made.__msgtype__
-        again = typestore().deserialize_cdr(typestore().serialize_cdr(made, name), name)
-        parent, pose = read_transforms(again).poses['sonar']
+        parent, pose = read_transforms(marine.sent(message(rpy=rpy))).poses['sonar']
         assert parent == 'base_link' and pose.position.tolist() == [1.0, 0.5, -0.2]
         assert pose.R == pytest.approx(geometry.rotation(*rpy), abs=1e-12)
-
-
-def test_one_transform_alone_is_read_and_none_is_refused():
+    # One alone is read, and none refused.
     (item,) = message(parent='/base_link', child='/sonar').transforms
     assert list(read_transforms(item).poses) == ['sonar']
     assert read_transforms(item).poses['sonar'][0] == 'base_link'
     assert reason(read_transforms, write_transforms(StaticTransforms(poses={}), ros_message))
 
 
-@pytest.mark.parametrize(
-    'name, value, code',
-    [
+def test_what_cannot_be_used_is_refused_with_its_reason():
+    for name, value, code in (
         ('transform__translation__x', math.nan, 'nan'),
         ('transform__rotation__w', math.inf, 'nan'),
         ('transform__rotation__w', 7.0, 'out_of_range'),
@@ -229,9 +202,7 @@ def test_one_transform_alone_is_read_and_none_is_refused():
         ('child_frame_id', 'base_link', 'no_frame'),
         ('child_frame_id', 'f' * 1001, 'too_large'),
         ('header__frame_id', 'f' * 1001, 'too_large'),
-    ],
-)
-def test_what_cannot_be_used_is_refused_with_its_reason(name, value, code):
-    made = message()
-    marine.put(made.transforms[0], **{name: value})
-    assert reason(read_transforms, made) == code
+    ):
+        made = message()
+        marine.put(made.transforms[0], **{name: value})
+        assert reason(read_transforms, made) == code

@@ -8,16 +8,14 @@
 
 """The node around a tracker, with real publishers and subscriptions in one process."""
 
-import itertools
 import time
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
-from helpers.node_bench import a_fix, FIX, Rig
+from helpers.node_bench import a_fix, FIX, Rig, values_of
 import pytest
-from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
@@ -28,14 +26,10 @@ from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.qos import output_qos
 
 POINT = 'geometry_msgs/msg/PointStamped'
+BOW = '-r', '__ns:=/auv1', '-r', '__node:=bow'
 SECOND = 10**9
 
 pytestmark = pytest.mark.usefixtures('walker')
-
-
-def a_point(seconds, x=1.0, y=2.0):
-    fix = a_fix(seconds, x, y)
-    return make(POINT, header=fix.header, point=fix.pose.pose.position)
 
 
 @pytest.fixture
@@ -54,65 +48,46 @@ def test_a_fix_becomes_an_estimate_with_its_stamp(rig):
     assert rig.answers[-1].header.stamp == a_fix(11.5).header.stamp
 
 
-def test_every_message_is_answered_also_without_an_estimate(rig):
-    rig.send(a_fix(1.0), a_fix(1.0), nan_fix(2.0), a_fix(3.0))
-    assert rig.answer == (4, 1, 2)
-
-
 def nan_fix(seconds):
     message = a_fix(seconds)
     message.pose.pose.position.x = float('nan')
     return message
 
 
-def test_late_input_revises_and_the_newest_comes_last(rig):
-    rig.send(a_fix(1.0, 0.0, 0.0), a_fix(3.0, 4.0, 4.0), a_fix(2.0, 2.0, 8.0))
-    assert rig.means()[2:] == [(2.0, 1.0, 4.0), (3.0, 2.0, 4.0)]
-
-
-def test_revisions_can_be_left_out(rig):
-    rig.node.set_parameters([Parameter('max_revisions', value=0)])
-    rig.send(a_fix(1.0, 0.0, 0.0), a_fix(3.0, 4.0, 4.0), a_fix(2.0, 2.0, 8.0))
-    assert rig.means()[2:] == [(3.0, 2.0, 4.0)]
-
-
-def test_revisions_are_bounded_and_counted(rig):
-    rig.node.set_parameters([Parameter('max_revisions', value=2)])
-    rig.send(*[a_fix(seconds, seconds, 0.0) for seconds in (1.0, 3.0, 4.0, 5.0, 6.0, 2.0)])
-    assert [mean[0] for mean in rig.means()[5:]] == [4.0, 5.0, 6.0]
-    assert rig.answer == (6, 0, 8)
-    assert rig.node._withheld == 2
+@pytest.mark.parametrize(
+    'most, shown, withheld',
+    [(100, [2.0, 3.0, 4.0, 5.0], 0), (2, [3.0, 4.0, 5.0], 1), (0, [5.0], 3)],
+)
+def test_late_input_revises_the_newest_comes_last_and_what_is_too_much_is_counted(
+    rig, most, shown, withheld
+):
+    rig.node.set_parameters([Parameter('max_revisions', value=most)])
+    rig.send(*[a_fix(seconds, seconds, 0.0) for seconds in (1.0, 3.0, 4.0, 5.0, 2.0)])
+    assert [mean[0] for mean in rig.means()[4:]] == shown and rig.means()[-1] == (5.0, 3.0, 0.0)
+    assert rig.answer == (5, 0, 4 + len(shown)) and rig.node._withheld == withheld
 
 
 def hostile():
     """Messages that a listener to a live topic meets sooner or later."""
-    yield 'not a number', nan_fix(5.0)
-    unstamped = a_fix(5.0)
-    unstamped.header.stamp.sec = unstamped.header.stamp.nanosec = 0
-    yield 'no stamp', unstamped
-    early = a_fix(5.0)
-    early.header.stamp.sec = -5
-    yield 'negative stamp', early
-    overfull = a_fix(5.0)
-    overfull.header.stamp.nanosec = 2**32 - 1
-    yield 'too many nanoseconds', overfull
+    yield nan_fix(5.0)
+    for stamp in ({'sec': 0, 'nanosec': 0}, {'sec': -5}, {'nanosec': 2**32 - 1}):
+        message = a_fix(5.0)
+        for name, value in stamp.items():
+            setattr(message.header.stamp, name, value)
+        yield message
     indefinite = a_fix(5.0)
     indefinite.pose.covariance[1] = indefinite.pose.covariance[6] = 1e3
-    yield 'indefinite covariance', indefinite
-    yield 'far away', a_fix_at(1e12)
-    yield 'other frame', a_fix(5.0, frame_id='odom')
+    yield indefinite
+    far_away = a_fix(5.0)
+    far_away.pose.pose.position.x = 1e12
+    yield far_away
+    yield a_fix(5.0, frame_id='odom')
 
 
-def a_fix_at(x):
-    message = a_fix(5.0)
-    message.pose.pose.position.x = x
-    return message
-
-
-def test_hostile_messages_are_refused_counted_and_survived(rig, capfd):
+def test_hostile_messages_are_refused_counted_and_survived_and_all_are_answered(rig, capfd):
     cases = list(hostile())
-    rig.send(a_fix(1.0), *(message for _, message in cases), a_fix(6.0, 3.0, 4.0))
-    assert rig.answer == (len(cases) + 2, len(cases), 2)
+    rig.send(a_fix(1.0), a_fix(1.0), *cases, a_fix(6.0, 3.0, 4.0))
+    assert rig.answer == (len(cases) + 3, len(cases), 2)
     assert rig.means()[-1] == (6.0, 2.0, 3.0)
     assert sum(rig.node._meter.refused.values()) == len(cases)
     assert 'Traceback' not in capfd.readouterr().err
@@ -160,26 +135,27 @@ def test_what_was_not_used_and_what_went_wrong_is_in_the_diagnostics(make_bench)
     rig.bench.spin_until(
         lambda: any('cannot be saved' in item.status[1].message for item in received)
     )
-    tracker = received[-1].status[1]
-    counts = {pair.key: pair.value for pair in tracker.values}
-    assert counts['count: revisions_withheld'] == '1'
-    assert counts['count: ignored_while_disabled'] == '2'
-    assert counts['count: internal_error'] == '3'
-    assert counts['count: used'] == '4'
-    assert 'an internal error was caught' in tracker.message
+    values, due = values_of(received[-1]), {'revisions_withheld': '1', 'used': '4'}
+    due |= {'ignored_while_disabled': '2', 'internal_error': '3'}
+    assert {name: values[f'count: {name}'] for name in due} == due
+    assert 'an internal error was caught' in received[-1].status[1].message
 
 
-def test_what_waited_too_long_is_answered_and_counted_but_not_used(make_bench, monkeypatch, capfd):
-    rig = Rig(make_bench('-p', 'max_wait:=50.0'))
-    late_s = 40
+def late_by(seconds, monkeypatch):
+    """Let what the node receives from now on have waited so long in its queue."""
 
     def time_ns():
-        return time.time_ns() + late_s * SECOND
+        return time.time_ns() + round(seconds * SECOND)
 
     clock = SimpleNamespace(time_ns=time_ns, monotonic=time.monotonic)
     monkeypatch.setattr(base, 'time', clock)
+
+
+def test_what_waited_too_long_is_answered_and_counted_but_not_used(make_bench, monkeypatch, capfd):
+    rig = Rig(make_bench(p=['max_wait:=50.0']))
+    late_by(40.0, monkeypatch)
     rig.send(a_fix(1.0))
-    late_s = 60
+    late_by(60.0, monkeypatch)
     rig.send(a_fix(2.0), a_fix(3.0))
     assert rig.answer == (3, 0, 1) and rig.node._meter.dropped == {'fix': 2}
     assert capfd.readouterr().err.count('those that waited more than 50 s are dropped') == 1
@@ -193,62 +169,43 @@ def test_the_age_of_estimates_is_that_of_their_publication(make_bench, monkeypat
     bench = make_bench()
     received = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     rig = Rig(bench)
-
-    def time_ns():
-        return time.time_ns() + 40 * SECOND
-
-    clock = SimpleNamespace(time_ns=time_ns, monotonic=time.monotonic)
-    monkeypatch.setattr(base, 'time', clock)
+    late_by(40.0, monkeypatch)
     now = rig.node.get_clock().now().nanoseconds * 1e-9
     rig.send(*(a_fix(now - 41.0 + 0.1 * k) for k in range(6)))
     bench.spin_until(lambda: any('s old: input' in item.status[1].message for item in received))
-    values = {pair.key: float(pair.value) for pair in received[-1].status[1].values}
-    waited = values['waited in the queue p50 [s]']
+    values = values_of(received[-1])
+    waited = float(values['waited in the queue p50 [s]'])
     assert 40.0 <= waited < 70.0  # the rest is the machine's
-    assert values['age of estimates p50 [s]'] == pytest.approx(waited + 1.0, abs=1.0)
+    assert float(values['age of estimates p50 [s]']) == pytest.approx(waited + 1.0, abs=1.0)
 
 
-def test_best_effort_publishers_are_heard(make_bench):
-    rig = Rig(make_bench(), qos=qos_profile_sensor_data)
-    rig.send(a_fix(1.0))
-    assert rig.answer == (1, 0, 1)
-
-
-def test_points_are_heard_when_asked_for(make_bench):
-    rig = Rig(make_bench('-p', f"input_types:=['fix={POINT}']"), publish=POINT)
-    rig.send(a_point(1.0, 1.0, 2.0))
-    assert rig.means() == [(1.0, 1.0, 2.0)]
-
-
-def test_north_east_down_input_comes_out_as_east_north_up(make_bench):
-    rig = Rig(make_bench('-p', 'world_frame_convention:=ned'))
-    rig.send(a_fix(1.0, 1.0, 2.0, frame_id='map_ned'))
-    assert rig.means() == [(1.0, 2.0, 1.0)]
-    assert rig.estimates[0].header.frame_id == 'map'
-
-
-def test_namespaces_and_names_move_everything(make_bench):
-    rig = Rig(make_bench('-r', '__ns:=/auv1', '-r', '__node:=bow'), prefix='/auv1', name='bow')
-    rig.send(a_fix(1.0))
-    assert rig.answer == (1, 0, 1)
-
-
-def test_inputs_can_be_remapped(make_bench):
-    bench = make_bench('-r', 'fix:=/usbl/position')
-    node = bench.add(TrackerNode('walker', context=bench.context))
-    publisher = bench.peer.create_publisher(message_class(FIX), '/usbl/position', 10)
-    bench.spin_until(publisher.get_subscription_count)
-    publisher.publish(a_fix(1.0))
-    bench.spin_until(lambda: node.tracker.counts['used'] == 1)
+@pytest.mark.parametrize(
+    'words, parameters, options, frame_id, place',
+    [
+        ((), (), {'qos': qos_profile_sensor_data}, 'map', (1.0, 2.0)),
+        ((), [f"input_types:=['fix={POINT}']"], {'publish': POINT}, 'map', (1.0, 2.0)),
+        ((), ['world_frame_convention:=ned'], {}, 'map_ned', (2.0, 1.0)),
+        (BOW, (), {'topic': '/auv1/fix', 'name': '/auv1/bow'}, 'map', (1.0, 2.0)),
+        (('-r', 'fix:=/usbl/position'), (), {'topic': '/usbl/position'}, 'map', (1.0, 2.0)),
+    ],
+    ids=['best effort', 'points', 'north, east, down', 'name and namespace', 'remapped'],
+)
+def test_what_is_heard_and_where(make_bench, words, parameters, options, frame_id, place):
+    rig = Rig(make_bench(*words, p=parameters), **options)
+    message = a_fix(1.0, frame_id=frame_id)
+    if options.get('publish') == POINT:
+        message = make(POINT, header=message.header, point=message.pose.pose.position)
+    rig.send(message)
+    assert rig.means() == [(1.0, *place)] and rig.estimates[0].header.frame_id == 'map'
 
 
 def test_qos_overrides_reach_the_endpoints(make_bench):
-    bench = make_bench(
-        '-p', 'qos_overrides./fix.subscription.reliability:=reliable', '-p',
-        'qos_overrides./fix.subscription.history:=keep_all', '-p',
-        'qos_overrides./walker/estimate.publisher.depth:=3',
+    given = (
+        '/fix.subscription.reliability:=reliable', '/fix.subscription.history:=keep_all',
+        '/walker/estimate.publisher.depth:=3',
     )  # fmt: skip
-    node = bench.add(TrackerNode('walker', context=bench.context))
+    bench = make_bench(p=[f'qos_overrides.{each}' for each in given])
+    node = bench.start(TrackerNode, 'walker')
     bench.spin_until(lambda: node.get_subscriptions_info_by_topic('/fix'))
     inputs = {s.topic_name: s.qos_profile for s in node.subscriptions}
     outputs = {p.topic_name: p.qos_profile for p in node.publishers}
@@ -260,54 +217,31 @@ def test_qos_overrides_reach_the_endpoints(make_bench):
 
 
 @pytest.mark.usefixtures('quick')
-def test_an_incompatible_publisher_is_named(make_bench, capfd):
-    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable')
+def test_an_incompatible_publisher_is_named_and_told_the_name_of_a_remapped_topic(
+    make_bench, capfd
+):
+    bench = make_bench(
+        '-r', 'fix:=/usbl/fix', p=['qos_overrides./fix.subscription.reliability:=reliable']
+    )
+    bench.start(TrackerNode, 'walker')
+    given = "remapped: write 'qos_overrides./usbl/fix.subscription.reliability'"
+    bench.spin_until(lambda: given in capfd.readouterr().err)
+    bench = make_bench(p=['qos_overrides./fix.subscription.reliability:=reliable'])
     received = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
-    node = bench.add(TrackerNode('walker', context=bench.context))
+    node = bench.start(TrackerNode, 'walker')
     bench.peer.create_publisher(message_class(FIX), '/fix', qos_profile_sensor_data)
     bench.spin_until(lambda: node._endpoints.incompatible)
     assert node._endpoints.incompatible == {'fix': 'RELIABILITY'}
     errors = capfd.readouterr().err
     assert "a peer on '/fix' cannot be heard: its RELIABILITY" in errors
     assert '-p qos_overrides./fix.subscription.reliability' in errors
-
-    def values():
-        """Of the newest report; one may have been on its way."""
-        return {pair.key: pair.value for pair in received[-1].status[0].values} if received else {}
-
-    bench.spin_until(lambda: 'incompatible peer on fix' in values())
-    assert values()['incompatible peer on fix'] == 'RELIABILITY'
-
-
-def test_a_quality_of_service_of_a_remapped_topic_is_told_its_name(make_bench, capfd):
-    bench = make_bench(
-        '-r', 'fix:=/usbl/fix', '-p', 'qos_overrides./fix.subscription.reliability:=reliable'
-    )
-    node = bench.add(TrackerNode('walker', context=bench.context))
-    bench.spin_until(lambda: node.get_subscriptions_info_by_topic('/usbl/fix'))
-    given = "remapped: write 'qos_overrides./usbl/fix.subscription.reliability'"
-    assert given in capfd.readouterr().err
-
-
-def test_accepted_changes_are_said_on_rosout(make_bench):
-    # A name of its own: a node of an earlier test that is only now collected takes the publisher
-    # of its name along. A late subscriber gets what was logged before: it may be known here and
-    # not yet matched.
-    rig = Rig(make_bench('-r', '__ns:=/talker'), prefix='/talker')
-    lasting = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    received = rig.bench.listen(Log, '/rosout', lasting)
-    times = itertools.cycle((3.5, 4.5))
-
-    def said():
-        # again and again: the first words may be lost before the two have met
-        rig.node.set_parameters([Parameter('stale_after', value=next(times))])
-        return any('stale_after is ' in item.msg for item in received)
-
-    rig.bench.spin_until(said)
+    received.clear()  # one report may have been on its way
+    bench.spin_until(lambda: received and 'incompatible peer on fix' in values_of(received[-1]))
+    assert values_of(received[-1])['incompatible peer on fix'] == 'RELIABILITY'
 
 
 def test_a_clock_that_goes_back_resets_and_its_first_tick_does_not(make_bench):
-    rig = Rig(make_bench('-p', 'use_sim_time:=true'))
+    rig = Rig(make_bench(p=['use_sim_time:=true']))
     clock = rig.bench.peer.create_publisher(Clock, '/clock', QoSProfile(depth=10))
     rig.bench.spin_until(clock.get_subscription_count)
 
@@ -326,22 +260,10 @@ def test_a_clock_that_goes_back_resets_and_its_first_tick_does_not(make_bench):
     assert rig.means()[-1] == (51.0, 7.0, 7.0)
 
 
-def test_two_nodes_of_one_name_space_do_not_meddle(make_bench):
-    bench = make_bench()
-    left = bench.add(TrackerNode('walker', context=bench.context, namespace='left'))
-    right = bench.add(TrackerNode('walker', context=bench.context, namespace='right'))
-    publisher = bench.peer.create_publisher(message_class(FIX), '/left/fix', 10)
-    bench.spin_until(publisher.get_subscription_count)
-    publisher.publish(a_fix(1.0))
-    bench.spin_until(lambda: left.tracker.counts['used'])
-    assert not right.tracker.counts
-
-
 def test_a_covariance_of_zeros_is_used_as_unknown_and_said_once(rig, capfd):
-    blank = a_fix(1.0)
-    blank.pose.covariance[:] = 0.0
-    again = a_fix(2.0)
-    again.pose.covariance[:] = 0.0
-    rig.send(blank, again)
+    blank = [a_fix(1.0), a_fix(2.0)]
+    for message in blank:
+        message.pose.covariance[:] = 0.0
+    rig.send(*blank)
     assert rig.answer == (2, 0, 2)
     assert capfd.readouterr().err.count('zero_covariance') == 1

@@ -13,16 +13,14 @@ import time
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from helpers.node_bench import a_fix, FIX, Rig
+from helpers.node_bench import a_fix, FIX, Rig, values_of
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy
 
 from msg_adapters.inputs import inputs_of, needed
-from sonar_imm.nodes.ages import Ages
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.diagnostics import clock_offset, Meter, Reporter, Stamp, summary
-from sonar_imm.nodes.messages import message_class
 from sonar_imm.nodes.qos import latched_qos, output_qos
 
 
@@ -50,13 +48,15 @@ class Desk:
 
     def follow(self, now, *, fix=(), refused=(), dropped=0, spent=(), says=(), **given):
         """What is heard and measured until `now`, a report, and what it has to say: levels,
-        `values`, and words of each entry."""
-        heard = {
-            'fix': fix,
-            **{name: given.pop(name, ()) for name in ('arrivals', 'altitude', 'nav')},
-        }
-        for name, times in heard.items():
-            for second in times:
+        `values`, and words of each entry. estimates: how many, their age, how long they waited,
+        and the period of messages."""
+        count, age, wait, *period = given.pop('estimates', (0, 0.0, 0.0))
+        for k in range(count, 0, -1):
+            then = now - k * (period[0] if period else 0.1)
+            self.meter.arrived('fix', then)
+            self.meter.estimates.published(then, age, wait)
+        for name in ('fix', 'arrivals', 'altitude', 'nav'):
+            for second in fix if name == 'fix' else given.pop(name, ()):
                 self.meter.arrived(name, second)
         for reason in refused:
             self.meter.refuse('fix', reason)
@@ -77,7 +77,41 @@ class Desk:
 OK, WARN = DiagnosticStatus.OK, DiagnosticStatus.WARN
 ERROR, STALE = DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 FINE = {'input': OK, 'tracker': OK}
+USED = 'not used: too_late'
 HISTORIES = {
+    'each input that is needed alone': [
+        {'now': 19.5, 'fix': range(20), 'input': STALE, 'tracker': STALE,
+         'says': 'no message yet on /nav|waiting for input: no message yet on /nav'},
+        {'now': 21.0, 'nav': [20.0], **FINE},
+        {'now': 29.5, 'fix': range(21, 30), 'input': STALE,
+         'says': 'no message for 9.5 s on /nav|'},
+    ],
+    # Two publishers that disagree by three seconds: every other message is too late.
+    'a share of messages of no use, forgotten after a while': [
+        {'now': k + 1.0, 'fix': k + np.arange(10) / 10.0,
+         'counts': Counter(used=10 * (k + 1) - (n := 5 * min(max(k - 9, 0), 10)), too_late=n),
+         **({'tracker': OK} if k < 10 or k >= 29 else {}),
+         **({'tracker': WARN, 'says': USED} if 12 <= k < 20 else {})}
+        for k in range(40)
+    ],
+    'estimates of a node that is too slow': [
+        {'now': 0.0},
+        {'now': 10.0, 'estimates': (100, 20.3, 20.2), 'dropped': 30},
+        {'now': 10.1, 'lost': {'fix': 70}, 'tracker': WARN,
+         'says': ['estimates are 20.2 s old: input comes faster', '100 of 170 messages lost'],
+         'values': {'age of estimates p50 [s]': '20.3', 'waited in the queue p50 [s]': '20.2'}},
+    ],
+    'old estimates, over when nothing comes': [
+        {'now': 5.0, 'estimates': (50, 20.0, 19.0), 'tracker': WARN, 'says': ' old'},
+        {'now': 20.0, 'stale_after': 60.0, 'tracker': OK},
+    ],
+    'a slow publisher, judged by its period': [
+        {'now': 60.0, 'estimates': (12, 8.0, 0.01, 5.0), 'stale_after': 60.0, 'tracker': OK},
+        {'now': 120.0, 'estimates': (12, 16.0, 0.01, 5.0), 'stale_after': 60.0,
+         'says': 'arrive that late'},
+        # A limit that is set counts.
+        {'now': 120.5, 'max_age': 20.0, 'stale_after': 60.0, 'tracker': OK},
+    ],
     'a silent start is stale': [
         {'now': 1.0, 'input': STALE, 'values': {'fix silent for [s]': 'nan'}},
     ],
@@ -163,42 +197,18 @@ HISTORIES = {
 """What happens until each report, and what it says."""
 
 
-@pytest.mark.parametrize('name', HISTORIES)
-def test_what_is_reported_of(desk, name):
-    for step in HISTORIES[name]:
-        desk.follow(**step)
-    assert (desk.input.name, desk.tracker.name) == ('diver: input', 'diver: tracker')
-
-
-def test_each_input_that_is_needed_is_looked_at_alone():
-    desk = Desk(required=('fix', 'nav'), one_of=())
-    waits = 'no message yet on /nav|waiting for input: no message yet on /nav'
-    desk.follow(19.5, fix=range(20), input=STALE, tracker=STALE, says=waits)
-    desk.follow(21.0, nav=[20.0], **FINE)
-    desk.follow(29.5, fix=range(21, 30), input=STALE, says='no message for 9.5 s on /nav|')
-
-
 @pytest.fixture
 def desk():
     return Desk()
 
 
-def test_a_share_of_messages_of_no_use_is_said_and_forgotten_after_a_while(desk):
-    counts = Counter(used=0)
-    for second in range(40):
-        now = float(second)
-        for k in range(10):
-            desk.meter.arrived('fix', now + k / 10.0)
-        # two publishers that disagree by three seconds: every other message is too late
-        counts['too_late' if 10 <= second < 20 else 'used'] += 5
-        counts['used'] += 5
-        desk.report(now + 1.0, counts=counts.copy())
-        if second < 10 or second >= 29:
-            assert desk.tracker.level == OK, desk.tracker.message
-        if 12 <= second < 20:
-            assert desk.tracker.level == WARN
-            assert 'not used: too_late' in desk.tracker.message
-    assert 'late' not in desk.tracker.message
+@pytest.mark.parametrize('name', HISTORIES)
+def test_what_is_reported_of(desk, name):
+    if name.startswith('each input'):
+        desk = Desk(required=('fix', 'nav'), one_of=())
+    for step in HISTORIES[name]:
+        desk.follow(**step)
+    assert (desk.input.name, desk.tracker.name) == ('diver: input', 'diver: tracker')
 
 
 @pytest.mark.parametrize(
@@ -218,168 +228,95 @@ def test_what_each_system_needs(system, settings, required, one_of):
     assert needed(inputs_of(system), settings) == (required, one_of)
 
 
-def estimates(desk, count, age, wait, *, period=0.1, start=0.0):
-    for k in range(count):
-        now = start + k * period
-        desk.meter.arrived('fix', now)
-        desk.meter.estimates.published(now, age, wait)
-    desk.report(start + count * period, stale_after=60.0)
-
-
-def test_estimates_of_a_node_that_is_too_slow_are_called_old(desk):
-    desk.report(0.0)
-    desk.meter.dropped['fix'] += 30
-    estimates(desk, 100, 20.3, 20.2)
-    desk.report(10.1, lost={'fix': 70})
-    assert desk.tracker.level == WARN
-    assert 'estimates are 20.2 s old: input comes faster' in desk.tracker.message
-    assert '100 of 170 messages lost' in desk.tracker.message
-    assert desk.values['age of estimates p50 [s]'] == '20.3'
-    assert desk.values['waited in the queue p50 [s]'] == '20.2'
-
-
 @pytest.mark.parametrize(
-    ('age', 'wait', 'level', 'words'),
+    'age, wait, level, words',
     [
         (0.4, 0.1, OK, 'tracking'),
         (3.0, 0.1, WARN, 'because their messages arrive that late'),
         (3.0, np.nan, WARN, 'because their messages arrive that late'),
-        (3600.0, 0.1, OK, '3600 s behind the clock of this computer'),
-        (-3600.0, 0.1, OK, '3600 s ahead of the clock of this computer'),
+        (3600.0, 0.1, OK, 'stamps are 3600 s behind'),
+        (-3600.0, 0.1, OK, 'stamps are 3600 s ahead of'),
         (4e7, 0.1, OK, 'tracking'),  # a recording
         (4e7, 5.0, WARN, 'estimates are 5.0 s old'),
+        # What waits in the node is no clock, and hides none.
+        (3602.0, 2.0, WARN, ['estimates are 2.0 s old', 'stamps are 3600 s behind']),
+        (-3598.0, 2.0, WARN, ['estimates are 2.0 s old', 'stamps are 3600 s ahead of']),
+        (100.0, 100.0, WARN, 'estimates are 100.0 s old'),
     ],
 )
 def test_the_cause_of_old_estimates_is_told_apart(desk, age, wait, level, words):
-    estimates(desk, 50, age, wait)
-    assert desk.tracker.level == level and words in desk.tracker.message
-
-
-@pytest.mark.parametrize(
-    ('age', 'wait', 'said'),
-    [
-        (3602.0, 2.0, ('estimates are 2.0 s old', 'stamps are 3600 s behind')),
-        (-3598.0, 2.0, ('estimates are 2.0 s old', 'stamps are 3600 s ahead of')),
-        (100.0, 100.0, ('estimates are 100.0 s old', '')),
-    ],
-)
-def test_what_waits_in_the_node_is_no_clock_and_hides_none(age, wait, said):
-    ages = Ages()
-    for k in range(12):
-        ages.published(0.1 * k, age, wait)
-    report = ages.report(1.2)
-    assert (report.slow.partition(':')[0], report.clock.partition(' the clock')[0]) == said
-
-
-def test_old_estimates_are_over_when_nothing_comes(desk):
-    estimates(desk, 50, 20.0, 19.0)
-    assert desk.tracker.level == WARN
-    desk.report(20.0, stale_after=60.0)
-    assert 'old' not in desk.tracker.message
-
-
-def test_the_age_of_a_slow_publisher_is_judged_by_its_period(desk):
-    estimates(desk, 12, 8.0, 0.01, period=5.0)
-    assert desk.tracker.level == OK
-    estimates(desk, 12, 16.0, 0.01, period=5.0, start=60.0)
-    assert 'arrive that late' in desk.tracker.message
-    # A limit that is set counts.
-    desk.report(120.5, max_age=20.0, stale_after=60.0)
-    assert desk.tracker.level == OK
+    desk.follow(5.0, estimates=(50, age, wait), tracker=level, says=words)
+    said = 'the clock of this computer' in desk.tracker.message
+    assert said == ('3600 s' in ''.join(words))
 
 
 @pytest.mark.usefixtures('quick')
 def test_a_node_reports_under_its_full_name_and_at_its_period(make_bench, walker):
-    bench = make_bench(
-        '-r', '__ns:=/auv1', '-p', 'use_sim_time:=true'
-    )  # no /clock at all: still it reports
+    # no /clock at all: still it reports
+    bench = make_bench('-r', '__ns:=/auv1', p=['use_sim_time:=true'])
     received = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
-    bench.add(TrackerNode('walker', context=bench.context))
+    bench.start(TrackerNode, 'walker')
     bench.spin_until(lambda: len(received) >= 3 and 'message' in received[-1].status[0].message)
-    assert [status.name for status in received[-1].status] == [
-        'auv1/walker: input',
-        'auv1/walker: tracker',
-    ]
-    values = {pair.key: pair.value for pair in received[-1].status[0].values}
-    assert values['fix topic'] == '/auv1/fix'
+    names = [status.name for status in received[-1].status]
+    assert names == ['auv1/walker: input', 'auv1/walker: tracker']
+    assert values_of(received[-1])['fix topic'] == '/auv1/fix'
     given = 'no message yet on /auv1/fix or /auv1/fixes or /auv1/relative or /auv1/arrivals'
     assert received[-1].status[0].message == given
 
 
-def run(desk, *refused):
-    """Levels of the input while one message a period comes, refused where `refused` says so."""
-    levels = []
-    for second, bad in enumerate(refused):
-        for k in range(2):
-            desk.meter.arrived('fix', second + 0.5 * k)
-        if bad:
-            desk.meter.refuse('fix', 'nan')
-        desk.report(second + 0.9)
-        levels.append(desk.input.level[0])
-    return levels
+def levels(heard, desk=None):
+    """Levels of the input after each period. heard: of each (messages of an input by its name,
+    refused ones, what else is reported)."""
+    desk, found = desk or Desk(rise=2, fall=5), []
+    for second, (messages, refused, *more) in enumerate(heard):
+        for name, count in messages.items():
+            for k in range(count):
+                desk.meter.arrived(name, second + k / max(count, 2))
+        for name in refused:
+            desk.meter.refuse(name, f'bad_{name}')
+        desk.report(second + 0.9, **(more[0] if more else {}))
+        found.append(desk.input.level[0])
+    return found
 
 
 def test_a_level_rises_after_two_bad_periods_falls_after_five_good_ones_and_does_not_flap():
-    levels = run(Desk(rise=2, fall=5), 0, 1, 0, 1, 1, 0, 0, 0, 0, 0, 0)
-    assert levels == [0, 0, 0, 0, 1, 1, 1, 1, 1, 0, 0]
-    desk = Desk(rise=2, fall=5)
-    rng = np.random.default_rng(5)
-    levels = run(desk, *(rng.random(600) < 0.5))
-    assert np.count_nonzero(np.diff(levels)) <= 2 * 600 * 0.5**6 + 8
-    assert np.mean(levels) > 0.8
-    calm = run(Desk(rise=2, fall=5), *([1, 0] * 100))
-    assert not any(calm)  # every other period, never two in a row
+    def of(refused):
+        return levels([({'fix': 2}, ['fix'] * int(bad)) for bad in refused])
+
+    assert of([0, 1, 0, 1, 1, 0, 0, 0, 0, 0, 0]) == [0, 0, 0, 0, 1, 1, 1, 1, 1, 0, 0]
+    found = of(np.random.default_rng(5).random(600) < 0.5)
+    assert np.count_nonzero(np.diff(found)) <= 2 * 600 * 0.5**6 + 8 and np.mean(found) > 0.8
+    assert not any(of([1, 0] * 100))  # every other period, never two in a row
 
 
 @pytest.mark.parametrize('beside', ['', 'heard', 'heard, and refused once'])
 def test_periods_without_a_message_say_nothing(beside):
     """A sensor that is heard every few periods is judged by the periods in which it is, whatever
     is heard `beside` it in all of them."""
-    desk = Desk(rise=2, fall=5)
-    levels = []
-    for second in range(60):
-        if beside:
-            desk.meter.arrived('altitude', second)
-        if 'refused' in beside and second == 0:
-            desk.meter.refuse('altitude', 'no_mounting')
-        if second % 4 == 0:
-            desk.meter.arrived('fix', second)
-            if second < 30:
-                desk.meter.refuse('fix', 'nan')
-        desk.report(second + 0.9)
-        levels.append(desk.input.level[0])
+    heard = [
+        ({'altitude': int(bool(beside)), 'fix': int(second % 4 == 0)},
+         ['altitude'] * ('refused' in beside and second == 0)
+         + ['fix'] * (second % 4 == 0 and second < 30))
+        for second in range(60)
+    ]  # fmt: skip
+    found = levels(heard)
     first, level = 8 if 'refused' in beside else 4, 1 if beside else 2
-    assert levels[:first] == [0] * first and levels[first:32] == [level] * (32 - first)
-    assert levels[47] == level and levels[48:] == [0] * 12
+    assert found[:first] == [0] * first and found[first:32] == [level] * (32 - first)
+    assert found[47] == level and found[48:] == [0] * 12
 
 
 def test_losses_of_a_latched_input_are_over_as_others():
-    desk = Desk(rise=2, fall=5)
-    levels = []
-    for second in range(16):
-        desk.meter.arrived('fix', second)
-        if second % 2 == 0:
-            desk.meter.arrived('tf_static', second)
-        desk.report(second + 0.9, lost={'/tf_static': min(second + 1, 4)})
-        levels.append(desk.input.level[0])
-    assert levels[2:4] == [1, 1] and levels[-1] == 0
+    lost = [{'lost': {'/tf_static': min(second + 1, 4)}} for second in range(16)]
+    found = levels([({'fix': 1, 'tf_static': 1 - k % 2}, (), more) for k, more in enumerate(lost)])
+    assert found[2:4] == [1, 1] and found[-1] == 0
 
 
 def test_all_refused_in_one_period_and_some_in_the_next_are_some_in_both():
-    desk = Desk(rise=2, fall=5)
-    levels = []
-    for second in range(6):
-        for k in range(1 + second % 2):
-            desk.meter.arrived('fix', second + 0.5 * k)
-        desk.meter.refuse('fix', 'nan')
-        desk.report(second + 0.9)
-        levels.append(desk.input.level[0])
-    assert levels == [0] + [1] * 5
+    assert levels([({'fix': 1 + second % 2}, ['fix']) for second in range(6)]) == [0] + [1] * 5
 
 
 def test_the_health_of_a_node_is_its_worst_entry(desk):
-    desk.meter.arrived('fix', 1.0)
-    desk.report(1.0, lost={'fix': 4})
+    desk.follow(1.0, fix=[1.0], lost={'fix': 4})
     given = summary('diver', [desk.input, desk.tracker])
     assert (given.level, given.name) == (WARN, 'diver')
     assert given.message == desk.input.message
@@ -394,24 +331,21 @@ def test_the_health_of_a_node_is_its_worst_entry(desk):
 
 
 def test_a_warning_is_the_same_one_when_its_numbers_change():
-    desk = Desk(rise=2, fall=5)
-    levels = []
+    desk, found = Desk(rise=2, fall=5), []
     for second, share in enumerate((12, 15, 9)):
-        desk.meter.arrived('fix', second)
-        desk.report(second + 0.9, warnings=[f'{share} % of the pings were passed over'])
-        levels.append(desk.tracker.level[0])
-    assert levels == [0, 1, 1] and desk.tracker.message.startswith('9 %')
+        desk.follow(
+            second + 0.9, fix=[second], warnings=[f'{share} % of the pings were passed over']
+        )
+        found.append(desk.tracker.level[0])
+    assert found == [0, 1, 1] and desk.tracker.message.startswith('9 %')
 
 
 @pytest.mark.usefixtures('quick')
 def test_health_waits_for_those_who_ask_later(make_bench, walker):
-    bench = make_bench()
-    node = bench.add(TrackerNode('walker', context=bench.context))
-    fix = bench.peer.create_publisher(message_class(FIX), 'fix', 10)
-    bench.spin_until(fix.get_subscription_count)
-    fix.publish(a_fix(1.0))
-    bench.spin_until(lambda: node._meter.received['fix'])
-    bench.spin_until(lambda: node._announcer.health.level == OK)
+    rig = Rig(make_bench())
+    bench = rig.bench
+    rig.send(a_fix(1.0))
+    bench.spin_until(lambda: rig.node._announcer.health.level == OK)
     late = bench.listen(DiagnosticStatus, '/walker/health', latched_qos())
     bench.spin_until(lambda: late)
     assert (late[0].name, late[0].message) == ('walker', 'receiving; tracking')
@@ -477,8 +411,7 @@ def test_stamps_of_one_clock_are_no_two(desk):
 def test_a_node_with_two_publishers_whose_clocks_disagree_says_so(make_bench, walker):
     rig = Rig(make_bench())
     received = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
-    other = rig.bench.peer.create_publisher(message_class(FIX), '/fix', 10)
-    rig.bench.spin_until(other.get_subscription_count)
+    other = rig.bench.publisher(FIX, '/fix', 10)
     start = time.time()
     rig.bench.spin_until(lambda: received)
     # As long as it takes: where the machine was busy meanwhile, messages came late as well.

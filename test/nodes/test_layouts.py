@@ -29,34 +29,21 @@ from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.resources import shared_file
 
 BAGS = {
-    'bathymetry': 'bathymetry_paper',
-    'fathometer': 'fathometer_drift',
-    'obstacle': 'obstacle_movers',
-    'diver': 'diver_multistatic',
-}
+    'bathymetry': 'bathymetry_paper', 'fathometer': 'fathometer_drift',
+    'obstacle': 'obstacle_movers', 'diver': 'diver_multistatic',
+}  # fmt: skip
 IN_3D = {
     'geometry_msgs/msg/PoseArray', 'geometry_msgs/msg/PoseWithCovarianceStamped',
     'nav_msgs/msg/Odometry', 'sensor_msgs/msg/PointCloud2', 'visualization_msgs/msg/MarkerArray',
 }  # fmt: skip
-RVIZ = {
-    'MarkerArray': 'visualization_msgs/msg/MarkerArray',
-    'Odometry': 'nav_msgs/msg/Odometry',
-    'PointCloud2': 'sensor_msgs/msg/PointCloud2',
-    'PoseArray': 'geometry_msgs/msg/PoseArray',
-    'PoseWithCovariance': 'geometry_msgs/msg/PoseWithCovarianceStamped',
-}
-DIAGNOSTICS = {'/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray'}
 
 
 def topics_of(system, make_bench):
     """Every topic of the running node with its type."""
-    bench = make_bench()
-    module = import_module(f'sonar_imm.nodes.{system}')
-    node = bench.add(getattr(module, f'{system.capitalize()}Node')(context=bench.context))
+    bench, module = make_bench(), import_module(f'sonar_imm.nodes.{system}')
+    node = bench.start(getattr(module, f'{system.capitalize()}Node'))
     received = bench.listen(DiagnosticArray, '/diagnostics')
-    bench.spin_until(
-        lambda: received and node._hears
-    )  # inputs are heard once kernels are compiled
+    bench.spin_until(lambda: received and node._hears)  # which is once kernels are compiled
     published = node.get_publisher_names_and_types_by_node(system, '/')
     subscribed = node.get_subscriber_names_and_types_by_node(system, '/')
     found = {name: types[0] for name, types in published + subscribed}
@@ -101,7 +88,7 @@ def check_foxglove(system, topics, estimate):
             for path in panel['paths']:
                 check_path(path, topics, estimate)
         else:
-            assert topics[panel['topicToRender']] == DIAGNOSTICS['/diagnostics']
+            assert topics[panel['topicToRender']] == 'diagnostic_msgs/msg/DiagnosticArray'
             assert panel.get('selectedName') in {None, *topics['states']}
     assert placed(layout_of(system)['layout']) == set(panels)
 
@@ -134,6 +121,7 @@ def check_rviz(system, topics, estimate):
     drawn = [display for display in displays if 'Topic' in display]
     assert drawn
     for display in drawn:
-        assert topics[display['Topic']['Value']] == RVIZ[display['Class'].partition('/')[2]]
+        drawn_as = topics[display['Topic']['Value']].rpartition('/')[2].removesuffix('Stamped')
+        assert drawn_as == display['Class'].partition('/')[2]
         if display['Class'].endswith('/PointCloud2'):
             assert display['Channel Name'] in estimate.columns()

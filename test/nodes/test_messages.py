@@ -39,27 +39,15 @@ def test_a_square_covariance_is_flattened_and_its_size_checked():
     'data', [b'\x01\x02', bytearray(b'\x01\x02'), [1, 2], np.array([1, 9, 2, 9], np.uint8)[::2]]
 )
 def test_bulk_bytes_take_any_form(data):
-    made = make('sensor_msgs/msg/PointCloud2', data=data)
-    assert made.data == array.array('B', [1, 2])
+    assert make('sensor_msgs/msg/PointCloud2', data=data).data == array.array('B', [1, 2])
 
 
-def test_bulk_doubles_from_float32_and_strings_from_a_tuple():
-    made = make(
-        'sensor_msgs/msg/JointState', name=('a', 'b'), position=np.array([0.25, 0.5], np.float32)
-    )
-    assert made.name == ['a', 'b']
-    assert made.position == array.array('d', [0.25, 0.5])
-
-
-def test_nested_messages_and_defaults():
-    header = make(
-        'std_msgs/msg/Header',
-        frame_id='map',
-        stamp=make('builtin_interfaces/msg/Time', sec=3, nanosec=4),
-    )
-    made = make('geometry_msgs/msg/PointStamped', header=header)
-    assert made.header.stamp.sec == 3
-    assert made.point.x == 0.0
+def test_bulk_doubles_from_float32_strings_from_a_tuple_and_messages_in_messages():
+    position, stamp = np.array([0.25, 0.5], np.float32), make('builtin_interfaces/msg/Time', sec=3)
+    header = make('std_msgs/msg/Header', frame_id='map', stamp=stamp)
+    made = make('sensor_msgs/msg/JointState', name=('a', 'b'), position=position, header=header)
+    assert made.name == ['a', 'b'] and made.position == array.array('d', [0.25, 0.5])
+    assert made.header.stamp.sec == 3 and made.header.stamp.nanosec == 0
 
 
 def test_unknown_fields_and_types_are_named():
@@ -105,18 +93,15 @@ CASES = [
 
 
 @pytest.mark.parametrize('repeat', [1, 2])
-def test_what_arrives_is_what_was_published_whatever_came_before(repeat):
+def test_what_arrives_is_what_was_published_whatever_came_before(repeat, monkeypatch):
     paper = Paper()
     publisher = TablePublisher(paper)
     for case in CASES:
         for _ in range(repeat):
             publisher.publish(table(**case))
             assert isinstance(paper.sent[-1], bytes) and paper.message == table(**case)
-
-
-def test_a_table_whose_bytes_are_not_understood_is_published_as_any_other_message(monkeypatch):
+    # A table whose bytes are not understood is published as any other message.
     monkeypatch.setattr('sonar_imm.nodes.outputs._STAMP', 8)
-    paper = Paper()
     publisher = TablePublisher(paper)
     for case in CASES:
         publisher.publish(table(**case))
@@ -137,10 +122,7 @@ def test_every_answer_has_its_counts_and_its_stamp():
         assert message.data == array.array('B', np.array([*counts.values()], '<f8').tobytes())
         assert [field.name for field in message.fields] == ['a', 'b']
         assert message.header.stamp == (type(stamp)() if when is None else when)
-
-
-def test_counts_beyond_32_bits_do_not_wrap():
-    paper = Paper()
+    # Counts beyond 32 bits do not wrap.
     answers = ProcessedPublisher(paper)
     for messages in (1, 2**32 + 7, 2**53 - 1):
         answers.publish({'messages': messages, 'refused': 0, 'estimates': messages - 1})

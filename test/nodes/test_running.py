@@ -14,16 +14,15 @@ import subprocess
 import sys
 import time
 
-from helpers.node_bench import a_fix, FIX
+from helpers.node_bench import a_fix, Rig
 import pytest
 import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty
 
-from sonar_imm.nodes.base import TrackerNode
-from sonar_imm.nodes.messages import message_class
 from sonar_imm.nodes.qos import Endpoints, lockstep_qos, output_qos
-from sonar_imm.nodes.running import EVENT_PERIOD, MessagesFirst
+from sonar_imm.nodes.running import EVENT_PERIOD, help_text, MessagesFirst
+from sonar_imm.parameters import ConfigError
 from sonar_imm_tools.replay.harness import reserved_domain_id
 from sonar_imm_tools.replay.link import Link
 
@@ -68,6 +67,14 @@ def test_events_are_asked_a_few_times_a_second_only(make_bench, monkeypatch):
 # -- How the process of a node ends --
 
 
+@pytest.mark.parametrize(
+    'words, said', [(['-p', 'a:=1.0'], "'-p' has to follow --ros-args"), (['on'], 'see --help')]
+)
+def test_words_that_are_no_ros_arguments_are_told(words, said):
+    with pytest.raises(ConfigError, match=said):
+        help_text(['diver', *words])
+
+
 PROGRAM = """
 import atexit, sys
 from sonar_imm.nodes.stopping import Stopper
@@ -95,6 +102,7 @@ from sonar_imm.nodes.running import run
 sys.argv = ['diver_node']
 sys.exit(run(lambda: Node('walker')))
 """
+LINK = f'from {Link.__module__} import Link; Link("peer")'
 
 
 @pytest.mark.parametrize(
@@ -109,47 +117,20 @@ def test_without_a_folder_for_its_log_a_node_says_what_to_set(folders):
     said = done.stderr.splitlines()[-1]
     assert said.startswith('diver_node: ROS cannot keep its log')
     assert said.endswith('set ROS_LOG_DIR to a folder that can be written to')
-
-
-def test_a_link_without_a_folder_for_its_log_says_the_same(monkeypatch):
-    monkeypatch.setenv('ROS_LOG_DIR', '/dev/null/log')
-    # Logging is initialized once for all contexts of a process.
-    words = f'from {Link.__module__} import Link; Link("peer")'
-    done = subprocess.run([sys.executable, '-c', words], capture_output=True, text=True)
-    assert 'LinkError: ROS cannot keep its log' in done.stderr
+    if 'ROS_LOG_DIR' in folders:  # a link says the same; logging is set up once for a process
+        link = subprocess.run(
+            [sys.executable, '-c', LINK], env={**usual, **folders}, capture_output=True, text=True
+        )
+        assert 'LinkError: ROS cannot keep its log' in link.stderr
 
 
 @pytest.mark.usefixtures('walker')
-def test_robots_in_domains_of_their_own_do_not_hear_each_other(monkeypatch):
+def test_robots_in_domains_of_their_own_do_not_hear_each_other(make_bench, monkeypatch):
     """With the same names on one machine: only the domain is another one."""
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    no_signals = rclpy.signals.SignalHandlerOptions.NO
-    with reserved_domain_id() as item, reserved_domain_id() as another:
-        assert item != another
-        contexts = [rclpy.Context(), rclpy.Context()]
-        for context, domain in zip(contexts, (item, another)):
-            rclpy.init(context=context, domain_id=domain, signal_handler_options=no_signals)
-        executors = [rclpy.executors.SingleThreadedExecutor(context=each) for each in contexts]
-        trackers = [TrackerNode('walker', context=each) for each in contexts]
-        peers = [rclpy.node.Node('peer', context=each) for each in contexts]
-        fixes = [each.create_publisher(message_class(FIX), '/fix', output_qos()) for each in peers]
-        for executor, *nodes in zip(executors, trackers, peers):
-            for node in nodes:
-                executor.add_node(node)
-        try:
-            end, counts = time.monotonic() + 240.0, []
-            while trackers[0]._meter.received['fix'] < 5 and time.monotonic() < end:
-                for executor in executors:
-                    executor.spin_once(timeout_sec=0.02)
-                counts = [each.get_subscription_count() for each in fixes]
-                if counts == [1, 1]:
-                    fixes[0].publish(a_fix(time.monotonic()))
-            assert counts == [1, 1]  # and not two each
-            assert trackers[0]._meter.received['fix'] >= 5
-            assert not trackers[1]._meter.received
-            assert [each.count_publishers('/fix') for each in trackers] == [1, 1]
-        finally:
-            for node in (*trackers, *peers):
-                node.destroy_node()
-            for context in contexts:
-                rclpy.try_shutdown(context=context)
+    with reserved_domain_id() as one, reserved_domain_id() as other:
+        rigs = [Rig(make_bench(domain_id=domain)) for domain in (one, other)]
+        rigs[0].send(*map(a_fix, range(1, 6)))
+        assert rigs[0].answer == (5, 0, 5) and not rigs[1].node._meter.received
+        for rig in rigs:  # and not two each
+            assert rig.fix.get_subscription_count() == rig.node.count_publishers('/fix') == 1

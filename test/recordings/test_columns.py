@@ -19,46 +19,41 @@ from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.times import BadRow
 
-
-@pytest.mark.parametrize(
-    'headers, found',
-    [
-        ('Zeitpunkt;Geogr. Breite;Geogr. Länge;Tiefe', 'stamp latitude longitude depth'),
-        ('Zeitstempel;Breitengrad;Längengrad;Genauigkeit', 'stamp latitude longitude std'),
-        ('Uhrzeit;Rechtswert;Hochwert;Gültig', 'stamp x y valid'),
-        ('Horodatage;Est;Nord;Écart-type;Valide', 'stamp x y std valid'),
-        ('Date;Heure;Latitude;Longitude;Profondeur', 'date stamp latitude longitude depth'),
-        ('Fecha;Hora;Latitud;Longitud;Profundidad', 'date stamp latitude longitude depth'),
-        ('Dato;Klokkeslett;Breddegrad;Lengdegrad;Dybde', 'date stamp latitude longitude depth'),
-        ('Tidspunkt;Øst;Nord;Navn', 'stamp x y id'),
-        ('Data;Hora;Leste;Norte;Alvo', 'date stamp x y id'),
-        ('BaseDateTime;MMSI;LAT;LON', 'stamp id latitude longitude'),
-        ('Zeit;Schiff Breite;Schiff Länge', 'stamp vessel_latitude vessel_longitude'),
-        ('Heure;Latitude navire;Longitude navire', 'stamp vessel_latitude vessel_longitude'),
-        ('time;Boat Easting;Boat Northing;Gyro', 'stamp vessel_x vessel_y heading'),
-        ('time;Distance;Relèvement;Cap', 'stamp range bearing heading'),
-        ('Zeit;Entfernung;Peilung;Zielnummer', 'stamp range bearing id'),
-        ('time;Target Lat;Target Lon', 'stamp latitude longitude'),
-        ('Latitude_deg;lon [deg]', 'latitude longitude'),
-        ('GPS Lat;GPS Long', 'latitude longitude'),
-        ('lat_dd;lon_dd', 'latitude longitude'),
-        ('Zeitstempel;Empfänger;Sender-ID', 'stamp receiver tag'),
-        (
-            'Tid;x fartoy;y fartoy;Forover (m);Styrbord (m)',
-            'stamp vessel_x vessel_y forward starboard',
-        ),
-        ('heading;Voraus;Steuerbord', 'heading forward starboard'),
-        ('Fecha y hora;Receptor;Transmisor', 'stamp receiver tag'),
-        ('Tempo;Alcance;Azimute;Rumo', 'stamp range bearing heading'),
-        ('Time;Rng (NM);rel_bearing;Rumbo buque', 'stamp range bearing heading'),
-    ],
-)
-def test_headers_in_six_languages(table, headers, found):
-    made = table(f'{headers}\n')
-    assert [made.index.get(name) for name in found.split()] == list(range(len(found.split())))
+HEADERS = """
+Zeitpunkt;Geogr. Breite;Geogr. Länge;Tiefe -> stamp latitude longitude depth
+Zeitstempel;Breitengrad;Längengrad;Genauigkeit -> stamp latitude longitude std
+Uhrzeit;Rechtswert;Hochwert;Gültig -> stamp x y valid
+Horodatage;Est;Nord;Écart-type;Valide -> stamp x y std valid
+Date;Heure;Latitude;Longitude;Profondeur -> date stamp latitude longitude depth
+Fecha;Hora;Latitud;Longitud;Profundidad -> date stamp latitude longitude depth
+Dato;Klokkeslett;Breddegrad;Lengdegrad;Dybde -> date stamp latitude longitude depth
+Tidspunkt;Øst;Nord;Navn -> stamp x y id
+Data;Hora;Leste;Norte;Alvo -> date stamp x y id
+BaseDateTime;MMSI;LAT;LON -> stamp id latitude longitude
+Zeit;Schiff Breite;Schiff Länge -> stamp vessel_latitude vessel_longitude
+Heure;Latitude navire;Longitude navire -> stamp vessel_latitude vessel_longitude
+time;Boat Easting;Boat Northing;Gyro -> stamp vessel_x vessel_y heading
+time;Distance;Relèvement;Cap -> stamp range bearing heading
+Zeit;Entfernung;Peilung;Zielnummer -> stamp range bearing id
+time;Target Lat;Target Lon -> stamp latitude longitude
+Latitude_deg;lon [deg] -> latitude longitude
+GPS Lat;GPS Long -> latitude longitude
+lat_dd;lon_dd -> latitude longitude
+Zeitstempel;Empfänger;Sender-ID -> stamp receiver tag
+Tid;x fartoy;y fartoy;Forover (m);Styrbord (m) -> stamp vessel_x vessel_y forward starboard
+heading;Voraus;Steuerbord -> heading forward starboard
+Fecha y hora;Receptor;Transmisor -> stamp receiver tag
+Tempo;Alcance;Azimute;Rumo -> stamp range bearing heading
+Time;Rng (NM);rel_bearing;Rumbo buque -> stamp range bearing heading
+"""
 
 
-def test_the_position_of_the_target_comes_first_and_a_hemisphere_is_no_northing(table):
+def test_headers_in_six_languages(table):
+    for line in HEADERS.strip().splitlines():
+        headers, found = line.split(' -> ')
+        index = table(f'{headers}\n').index
+        assert [index.get(name) for name in found.split()] == list(range(len(found.split()))), line
+    # The position of the target comes first, and a hemisphere is no northing.
     assert 'y' not in table('time,lat,N/S,lon,E/W\n').index
     made = table('time,lat,lon,target_lat,target_lon\n')
     assert (made.index['latitude'], made.index['longitude']) == (3, 4)
@@ -85,12 +80,12 @@ def test_units_of_headers_are_heeded(table, name, header, cell, value):
     assert row.number(name) == pytest.approx(value, rel=1e-5)
 
 
-@pytest.mark.parametrize('header', ['x [px]', 'East (deg)', 'Depth (dbar)', 'Länge [m],lat'])
-def test_a_unit_of_another_kind_is_refused(table, header):
-    made = table(f'{header},time\n1,1,1\n')
-    (row,) = made
-    with pytest.raises(BagError, match='name another column with --column'):
-        row.number(next(iter(set(made.index) - {'latitude', 'stamp'})))
+def test_a_unit_of_another_kind_is_refused(table):
+    for header in ('x [px]', 'East (deg)', 'Depth (dbar)', 'Länge [m],lat'):
+        made = table(f'{header},time\n1,1,1\n')
+        (row,) = made
+        with pytest.raises(BagError, match='name another column with --column'):
+            row.number(next(iter(set(made.index) - {'latitude', 'stamp'})))
 
 
 PLACES = [
@@ -133,108 +128,93 @@ PLACES = [
     ('Latitude (S),Longitude (°W)', '33.5,70.25', (-33.5, -70.25)),
     ('Latitude (°S),Longitude (E+)', '33.5,-70.25', (-33.5, -70.25)),
     ('Latitud (Norte),Longitud (Oeste)', '33.5,70.25', (33.5, -70.25)),
+    ('lat,N/S,lon,E/W', '33.5,X,70.25,W', "hemisphere 'X'"),
+    ('lat,N/S,lon,E/W', '33.5,,70.25,W', "hemisphere 'nothing'"),
+    ('lat,N/S,lon,E/W', '-33.5,N,70.25,W', "hemisphere 'N'"),
+    ('lat,lon', '33.5 E,70.25 N', "hemisphere 'E'"),
+    ('lat,N/S,lon,E/W', '33.5 N,S,70.25,W', "hemisphere 'S'"),
+    ('lat,lon', '59 75.8,10 28.2', "lat is '59 75.8'"),
+    ('lat,lon', '0,0', 'receivers without a fix'),
+    ('lat,lon', '0.0000001,0.0000001', 'receivers without a fix'),
+    ('lat,lon', '91,181', 'no position in AIS'),
+    ('lat,lon', '-999,-999', 'not a position on Earth'),
+    ('lat,lon', '59.43,null', 'lon is empty'),
 ]  # fmt: skip
+"""Headers, cells, and the place or why it is none."""
 
 
-@pytest.mark.parametrize('header, cells, place', PLACES)
-def test_degrees_in_every_spelling(table, header, cells, place):
-    made = table(f'time,{header}\n1,{cells}\n')
-    assert Degrees(made).place(next(iter(made))) == pytest.approx(place, abs=1e-9)
+def place_of(made):
+    return Degrees(made).place(next(iter(made)))
 
 
-@pytest.mark.parametrize(
-    'header, cells, words',
-    [
-        ('lat,N/S,lon,E/W', '33.5,X,70.25,W', "hemisphere 'X'"),
-        ('lat,N/S,lon,E/W', '33.5,,70.25,W', "hemisphere 'nothing'"),
-        ('lat,N/S,lon,E/W', '-33.5,N,70.25,W', "hemisphere 'N'"),
-        ('lat,lon', '33.5 E,70.25 N', "hemisphere 'E'"),
-        ('lat,N/S,lon,E/W', '33.5 N,S,70.25,W', "hemisphere 'S'"),
-        ('lat,lon', '59 75.8,10 28.2', "lat is '59 75.8'"),
-        ('lat,lon', '0,0', 'receivers without a fix'),
-        ('lat,lon', '0.0000001,0.0000001', 'receivers without a fix'),
-        ('lat,lon', '91,181', 'no position in AIS'),
-        ('lat,lon', '-999,-999', 'not a position on Earth'),
-        ('lat,lon', '59.43,null', 'lon is empty'),
-    ],
-)
-def test_what_is_no_position_is_a_bad_row(table, header, cells, words):
-    made = table(f'time,{header}\n1,{cells}\n')
-    (row,) = made
-    with pytest.raises(BadRow, match=words):
-        Degrees(made).place(row)
+def test_degrees_in_every_spelling(table):
+    for header, cells, place in PLACES:
+        made = table(f'time,{header}\n1,{cells}\n')
+        if isinstance(place, tuple):
+            assert place_of(made) == pytest.approx(place, abs=1e-9), cells
+        else:
+            with pytest.raises(BadRow, match=place):
+                place_of(made)
 
 
-def test_o_alone_and_latitude_and_longitude_exchanged_are_questions(table):
+def test_o_alone_one_hemisphere_and_degrees_exchanged_are_questions(table):
     with pytest.raises(BagError, match='may be east .Ost. or west'):
         Degrees(table('lat,ns,lon,ew\n33,S,70,O\n'))
     text = 'time,Lat,Lon\n1,115.1,-33.5\n'
     with pytest.raises(BagError, match="--column 'latitude=Lon' --column 'longitude=Lat'"):
         Degrees(table(text))
-    made = table(text, columns={'latitude': 'Lon', 'longitude': 'Lat'})
-    assert Degrees(made).place(next(iter(made))) == (-33.5, 115.1)
+    assert place_of(table(text, columns={'latitude': 'Lon', 'longitude': 'Lat'})) == (-33.5, 115.1)
+    for text in ('lat,mode,lon\n33.5,S,70.25\n', 'mode,lat,lon\nS,33.5,70.25\n'):
+        with pytest.raises(BagError, match="'latitude_hemisphere=mode' or --ignore latitude_h"):
+            Degrees(table(text))
+        south = table(text, columns={'latitude_hemisphere': 'mode'})
+        assert place_of(south) == (-33.5, 70.25)
+        assert place_of(table(text, ignore=['latitude_hemisphere'])) == (33.5, 70.25)
 
 
-@pytest.mark.parametrize(
-    'text, value',
-    [
+def test_commas_in_numbers(table):
+    for text, value in (
         ('time,x\n1,"1,5"\n', 1.5),
         ('time,x\n1,"1,500"\n2,"1,5"\n', 1.5),
         ('time,x\n1,"1,234.5"\n', 1234.5),
         ('time;x\n1;1.234,5\n', 1234.5),
         ('time;x\n1;1,234\n', 1.234),
         ('sep=;\nZeit;x;y\n1;2,5;3\n', 2.5),  # names the delimiter
-        ('time,x\n1,"1,500"\n', 'thousands or a decimal one'),
-    ],
-)
-def test_commas_in_numbers(table, text, value):
-    row = next(iter(table(text)))
-    if isinstance(value, float):
-        assert row.number('x') == value
-    else:
-        with pytest.raises(BadRow, match=value):
-            row.number('x')
-
-
-@pytest.mark.parametrize(
-    'header, words',
-    [
-        ('Status', 'OK Fehler* ok nein* Fehler4*'), ('Statut', 'valide invalide*'),
-        ('Estado', 'bueno malo*'), ('Gültig', 'ja nein*'), ('valid', '1 0* true'),
-        ('status', 'A V*'), ('status', '4 5 0'), ('status', 'A B C'),
-        ('Kvalitet', 'god feil* ok bad*'), ('quality', 'good fair invalid*'),
-        ('Fix Quality', 'fix float 0 1 no*'), ('quality', 'n 0 f'),
-        ('quality,valid', 'bad,1* ok,0* ok,1'),
-    ],
-)  # fmt: skip
-def test_words_for_bad_rows(table, header, words):
-    """Those with a star."""
-    cells = words.split()
-    for cell, row in zip(
-        cells, table('\n'.join([f'{header},x', *(f'{c.strip("*")},1' for c in cells)]))
     ):
-        if cell == 'Fehler4*':
-            with pytest.raises(BadRow, match='neither true nor false'):
+        assert next(iter(table(text))).number('x') == value
+    with pytest.raises(BadRow, match='thousands or a decimal one'):
+        next(iter(table('time,x\n1,"1,500"\n'))).number('x')
+
+
+FLAGS = [
+    ('Status', 'OK Fehler* ok nein* Fehler4?'), ('Statut', 'valide invalide*'),
+    ('Estado', 'bueno malo*'), ('Gültig', 'ja nein*'), ('valid', '1 0* true'),
+    ('status', 'A V*'), ('status', '4 5 0'), ('status', 'A B C'),
+    ('Kvalitet', 'god feil* ok bad*'), ('quality', 'good fair invalid*'),
+    ('Fix Quality', 'fix float 0 1 no*'), ('quality', 'n 0 f'),
+    ('quality,valid', 'bad,1* ok,0* ok,1'),
+]  # fmt: skip
+
+
+def test_words_for_bad_rows(table):
+    """Those with a star; one with a question mark is neither."""
+    for header, words in FLAGS:
+        rows = table('\n'.join([f'{header},x', *(f'{c.strip("*?")},1' for c in words.split())]))
+        for cell, row in zip(words.split(), rows):
+            if cell[-1] not in '*?':
                 row.require_valid()
-        elif cell.endswith('*'):
-            with pytest.raises(BadRow, match='flagged as invalid'):
+                continue
+            why = 'flagged as invalid' if cell[-1] == '*' else 'neither true nor false'
+            with pytest.raises(BadRow, match=why):
                 row.require_valid()
-        else:
-            row.require_valid()
 
 
 @pytest.mark.parametrize(
     'header, cells, named',
-    [
-        ('Kurs [°]', '{c}', 'Kurs'),
-        ('heading', '{c}', 'heading'),
-        ('Rumbo buque', '{k}', 'Rumbo buque'),
-        ('ship speed', '3', 'ship speed'),
-        ('pos1;pos2', '59.4{c};10.4{c}', 'pos1, pos2'),
-        ('SNR [dB];no', '{c};{k}', ''),
-        ('note;port', 'a{k};7', ''),
-    ],
-)
+    [('Kurs [°]', '{c}', 'Kurs'), ('heading', '{c}', 'heading'), ('SNR [dB];no', '{c};{k}', ''),
+     ('Rumbo buque', '{k}', 'Rumbo buque'), ('ship speed', '3', 'ship speed'),
+     ('pos1;pos2', '59.4{c};10.4{c}', 'pos1, pos2'), ('note;port', 'a{k};7', '')],
+)  # fmt: skip
 def test_columns_that_may_be_the_vessel_are_a_question(convert, header, cells, named):
     rows = [f'{k};50;{k}0;' + cells.format(k=k, c=k * k + 3) for k in range(1, 9)]
     text = '\n'.join([f'time;range;bearing_deg;{header}', *rows]) + '\n'
@@ -266,16 +246,12 @@ def test_columns_that_are_zero_throughout_give_way_to_filled_ones(convert):
 
 @pytest.mark.parametrize(
     'header, cells, words',
-    [
-        ('lat,Latitude,lon', '59.0,59.1,10', 'Latitude and lat may both be latitude'),
-        ('lat,Latitude,lon', '59.1,59.1,10', ''),
-        ('lat,target_lat,lon,target_lon', '59.0,59.1,10,11', ''),
-        ('Depth (m),Depth (ft)', '10,32.8', ''),
-        ('Depth (m),Tiefe', '10,32.8', 'may both be depth'),
-        ('heading,gyro', '90,95', 'may both be heading'),
-        ('east,easting', '1,2', 'may both be x'),
-    ],
-)
+    [('lat,Latitude,lon', '59.0,59.1,10', 'Latitude and lat may both be latitude'),
+     ('lat,Latitude,lon', '59.1,59.1,10', ''), ('Depth (m),Depth (ft)', '10,32.8', ''),
+     ('lat,target_lat,lon,target_lon', '59.0,59.1,10,11', ''),
+     ('Depth (m),Tiefe', '10,32.8', 'may both be depth'),
+     ('heading,gyro', '90,95', 'may both be heading'), ('east,easting', '1,2', 'both be x')],
+)  # fmt: skip
 def test_two_columns_of_one_quantity_are_a_question(table, header, cells, words):
     text = f'time,{header}\n1,{cells}\n'
     (row,) = made = table(text)
@@ -303,45 +279,40 @@ def test_metres_and_degrees_that_disagree_are_a_question(convert):
         assert column in notes['columns of in.csv']
 
 
-@pytest.mark.parametrize(
-    'header, start, step, words, answer',
-    [
-        ('x,y', (-10.25, 54.5), 1e-5, 'as degrees do.*--column longitude=x', 'latitude=y'),
-        ('x,y', (-10.25, 54.5), 1e-5, 'or for metres --column x=x --column y=y', 'y=y'),
-        ('lat,lon', (0.951204, -0.178896), 1.6e-7, 'degrees or radians', 'latitude_rad'),
-        ('x,y', (-10.25, 54.5), 0.3, '', ''),
-        ('x [m],y [m]', (-10.25, 54.5), 1e-5, '', ''),
-        ('lat_rad,lon_rad', (0.951204, -0.178896), 1.6e-7, '', ''),
+def test_degrees_that_are_called_otherwise_are_a_question(convert):
+    degrees, radians = (-10.25, 54.5), (0.951204, -0.178896)
+    for k, (header, (x, y), step, words, answer) in enumerate((
+        ('x,y', degrees, 1e-5, 'as degrees do.*--column longitude=x', 'latitude=y'),
+        ('x,y', degrees, 1e-5, 'or for metres --column x=x --column y=y', 'y=y'),
+        ('lat,lon', radians, 1.6e-7, 'degrees or radians', 'latitude_rad'),
+        ('x,y', degrees, 0.3, '', ''), ('x [m],y [m]', degrees, 1e-5, '', ''),
+        ('lat_rad,lon_rad', radians, 1.6e-7, '', ''),
         ('lat,lon', (0.951204, -3.178896), 1e-5, '', ''),
-    ],
-)
-def test_degrees_that_are_called_otherwise_are_a_question(
-    convert, header, start, step, words, answer
-):
-    rows = ''.join(f'{k},{start[0]:.9f},{start[1] + step * k:.9f}\n' for k in range(9))
-    text = f'time,{header}\n{rows}'
-    if words:
-        with pytest.raises(BagError, match=words) as caught:
-            convert(text)
-        assert answer in str(caught.value)
-    how = CsvOptions(columns={'x': 'x', 'y': 'y'} if answer == 'y=y' else {})
-    if not words or answer == 'y=y':
-        assert convert(text, options=how).messages == {'/fix': 9}
+    )):  # fmt: skip
+        text = f'time,{header}\n' + ''.join(f'{k},{x:.9f},{y + step * k:.9f}\n' for k in range(9))
+        if words:
+            with pytest.raises(BagError, match=words) as caught:
+                convert(text)
+            assert answer in str(caught.value)
+        how = CsvOptions(columns={'x': 'x', 'y': 'y'} if answer == 'y=y' else {})
+        if not words or answer == 'y=y':
+            assert convert(text, out=f'{k}', options=how).messages == {'/fix': 9}
 
 
-@pytest.mark.parametrize('places', ['lat;lon', 'Breite;Länge', 'x;y'])
-def test_positions_beside_range_and_bearing_are_a_question(convert, places):
+def test_positions_beside_range_and_bearing_are_a_question(convert):
     """Those of the target or those of a vessel: each reading has its option."""
     rows = ''.join(f'{k};59.4;10.{k};{80 + k * k};50;{k}0\n' for k in range(1, 9))
-    text = f'time;{places};heading;range;bearing_deg\n{rows}'
-    with pytest.raises(BagError) as caught:
-        convert(text)
-    sentence = caught.value.sentence
-    assert '--ignore range' in sentence and 'convert relative' in sentence
-    assert convert(text, options=CsvOptions(ignore=['range'])).messages == {'/fix': 8}
-    pairs = re.findall("--column '(vessel_[a-z]+)=([^']+)'", sentence)
-    how = CsvOptions(columns=dict(pairs))
-    assert convert(text, 'relative', 'vessel', options=how).messages['/relative'] == 8
+    for places in ('lat;lon', 'Breite;Länge', 'x;y'):
+        text = f'time;{places};heading;range;bearing_deg\n{rows}'
+        with pytest.raises(BagError) as caught:
+            convert(text)
+        sentence = caught.value.sentence
+        assert '--ignore range' in sentence and 'convert relative' in sentence
+        how = CsvOptions(ignore=['range'])
+        assert convert(text, out=places, options=how).messages == {'/fix': 8}
+        pairs = re.findall("--column '(vessel_[a-z]+)=([^']+)'", sentence)
+        how = CsvOptions(columns=dict(pairs))
+        assert convert(text, 'relative', f'{places}2', options=how).messages['/relative'] == 8
 
 
 @pytest.mark.parametrize(
@@ -358,10 +329,12 @@ def test_bearings_whose_word_is_of_another_direction_are_a_question(convert, kin
     cells = {'relative': '0;{k};90;50', 'fixes': '50'}[kind]
     rows = ''.join(f'{k};{cells.format(k=k)};{k}0\n' for k in range(1, 9))
     text = f'{head};{header}\n{rows}'
-    if asked:
-        with pytest.raises(BagError, match='--bearings (bow or --bearings north|north or --bear)'):
-            convert(text, kind)
-    for bearings in ('north', 'bow') if kind == 'relative' and asked else (None,) * (not asked):
+    if not asked:
+        assert convert(text, kind).messages
+        return
+    with pytest.raises(BagError, match='--bearings (bow or --bearings north|north or --bear)'):
+        convert(text, kind)
+    for bearings in ('north', 'bow') if kind == 'relative' else ():
         assert convert(text, kind, f'out_{bearings}', bearings=bearings).messages
 
 
@@ -375,60 +348,39 @@ def test_a_depth_that_is_not_tracked_is_said_and_the_advice_helps(convert):
     assert first.position[2] == -6.0 and first.covariance[2, 2] == 0.25
 
 
-@pytest.mark.parametrize(
-    'place, asked', [('10.47,59.43', True), ('59.43,10.47', False), ('-20,150', False)]
-)
-def test_positions_near_a_stated_origin_only_when_exchanged_are_a_question(convert, place, asked):
-    text, how = f'time,lat,lon\n1,{place}\n', {}
-    if asked:
-        with pytest.raises(BagError, match="--column 'latitude=lon' --column 'longitude=lat'"):
-            convert(text, origin=(59.4, 10.4))
-        how = {'latitude': 'lon', 'longitude': 'lat'}
-    assert convert(text, origin=(59.4, 10.4), options=CsvOptions(columns=how)).messages
+def test_positions_near_a_stated_origin_only_when_exchanged_are_a_question(convert):
+    exchanged = CsvOptions(columns={'latitude': 'lon', 'longitude': 'lat'})
+    with pytest.raises(BagError, match="--column 'latitude=lon' --column 'longitude=lat'"):
+        convert('time,lat,lon\n1,10.47,59.43\n', origin=(59.4, 10.4))
+    for place, how in (('10.47,59.43', exchanged), ('59.43,10.47', None), ('-20,150', None)):
+        text, out = f'time,lat,lon\n1,{place}\n', f'out_{place}'
+        assert convert(text, out=out, origin=(59.4, 10.4), options=how).messages
 
 
-@pytest.mark.parametrize('depths, asked', [('-5 -6', True), ('-0.1 6', False), ('0 0', False)])
-def test_a_depth_that_is_negative_throughout_is_asked_about(convert, depths, asked):
-    rows = ''.join(f'{k},1,{k},{depth}\n' for k, depth in enumerate(depths.split(), start=1))
-    text = f'time,x,y,Depth\n{rows}'
-    assert any("'z=Depth' meant" in question for question in convert(text).questions) == asked
+def test_a_depth_that_is_negative_throughout_is_asked_about(convert):
+    for depths, asked in (((-5, -6), True), ((-0.1, 6), False), ((0, 0), False)):
+        rows = ''.join(f'{k},1,{k},{depth}\n' for k, depth in enumerate(depths, start=1))
+        report = convert(f'time,x,y,Depth\n{rows}', out=f'out{depths}')
+        assert any("'z=Depth' meant" in question for question in report.questions) == asked
     how = CsvOptions(columns={'z': 'Depth'})
-    assert not asked or not convert(text, out='up', options=how).questions
+    assert not convert('time,x,y,Depth\n1,1,1,-5\n2,1,2,-6\n', out='up', options=how).questions
 
 
-@pytest.mark.parametrize(
-    'header, cells', [('lat,mode,lon', '33.5,S,70.25'), ('mode,lat,lon', 'S,33.5,70.25')]
-)
-def test_one_column_of_hemispheres_alone_is_a_question(table, header, cells):
-    text = f'{header}\n{cells}\n'
-    with pytest.raises(BagError, match="'latitude_hemisphere=mode' or --ignore latitude_h"):
-        Degrees(table(text))
-    for how, latitude in (
-        ({'columns': {'latitude_hemisphere': 'mode'}}, -33.5),
-        ({'ignore': ['latitude_hemisphere']}, 33.5),
-    ):
-        made = table(text, **how)
-        assert Degrees(made).place(next(iter(made))) == (latitude, 70.25)
-
-
-@pytest.mark.parametrize(
-    'kind, head, cells',
-    [
-        ('fixes', 'time;lat;lon;Name', '{k};59.4;{x};Schmidt'),
-        ('relative', 'time;boat_lat;boat_lon;heading;range;bearing_deg;Zielname',
-         '{k};59.4;{x};90;50;10;Schmidt'),
-    ],
-)  # fmt: skip
-def test_names_of_targets_travel_to_the_export(convert, tmp_path, kind, head, cells):
+def test_names_of_targets_travel_to_the_export(convert, tmp_path):
     """From the table by bag and run.json to the name of the track."""
-    rows = [cells.format(k=k, x=10.0 + 1e-5 * k) for k in range(1, 31)]
-    bag = convert('\n'.join([head, *rows]) + '\n', kind).path
-    assert main(['track', str(bag), str(tmp_path / 'run')]) == 0
-    for end in ('gpx', 'kml', 'geojson', 'csv'):
-        out = tmp_path / f'out.{end}'
-        assert main(['export', str(tmp_path / 'run'), str(out)]) == 0
-        wanted = '<name>Schmidt</name>' if end == 'gpx' else 'Schmidt'
-        assert wanted in out.read_text(encoding='utf-8')
+    of_vessel = 'time;boat_lat;boat_lon;heading;range;bearing_deg;Zielname'
+    for kind, head, cells in (
+        ('fixes', 'time;lat;lon;Name', '{k};59.4;{x};Schmidt'),
+        ('relative', of_vessel, '{k};59.4;{x};90;50;10;Schmidt'),
+    ):
+        rows = [cells.format(k=k, x=10.0 + 1e-5 * k) for k in range(1, 31)]
+        bag = convert('\n'.join([head, *rows]) + '\n', kind, kind).path
+        assert main(['track', str(bag), str(tmp_path / f'run_{kind}')]) == 0
+        for end in ('gpx', 'kml', 'geojson', 'csv'):
+            out = tmp_path / f'{kind}.{end}'
+            assert main(['export', str(tmp_path / f'run_{kind}'), str(out)]) == 0
+            wanted = '<name>Schmidt</name>' if end == 'gpx' else 'Schmidt'
+            assert wanted in out.read_text(encoding='utf-8')
 
 
 def test_forms_that_were_found_out_are_said(convert):
@@ -450,33 +402,27 @@ def test_units_in_a_row_below_the_headers(table):
     assert len(list(table('time,x,status\nnone,none,bad\n1,2,ok\n'))) == 2
 
 
-def test_n_and_e_over_letters_are_hemispheres(convert):
+def test_letters_below_n_and_e_are_hemispheres_and_an_altitude_beside_a_depth_is_no_height(
+    convert,
+):
     report = convert('time,lat,N,lon,E\n1,33.5,S,70.25,W\n2,33.6,S,70.25,W\n')
     assert measured(report.path)[1].position[1] == pytest.approx(-11_094, abs=10)
+    report = convert('time,lat,lon,depth,altitude\n1,59.43,10.47,12.5,3.2\n', out='other')
+    assert measured(report.path)[0].position == pytest.approx([0.0, 0.0, -12.5], abs=1e-6)
 
 
-def test_an_altitude_beside_a_depth_is_that_over_the_ground(convert):
-    (fix,) = measured(convert('time,lat,lon,depth,altitude\n1,59.43,10.47,12.5,3.2\n').path)
-    assert fix.position == pytest.approx([0.0, 0.0, -12.5], abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    'header, ranges, x',
-    [
-        ('slant range', '', 40.0), ('Distance oblique (m)', '', 40.0), ('range', 'slant', 40.0),
-        ('range', 'horizontal', 50.0), ('horizontal range', '', 50.0), ('range', '', None),
-    ],
-)  # fmt: skip
-def test_ranges_are_slant_or_horizontal_where_the_depth_matters(convert, header, ranges, x):
-    text = f'time,{header},bearing_deg,depth\n1,50,90,30\n2,50,90,30\n'
-    how = {'bearings': 'north', **({'ranges': ranges} if ranges else {})}
-    if x is None:
-        with pytest.raises(BagError, match='say --ranges slant or --ranges horizontal'):
-            convert(text, **how)
-    else:
-        assert measured(convert(text, **how).path)[0].position == pytest.approx([x, 0.0, -30.0])
-
-
-def test_a_depth_that_hardly_matters_is_no_question(convert):
-    report = convert('time,range,bearing_deg,depth\n1,50,90,3\n2,50,90,3\n')
-    assert measured(report.path)[0].position[0] == pytest.approx(50.0)
+def test_ranges_are_slant_or_horizontal_where_the_depth_matters(convert):
+    for header, ranges, depth, x in (
+        ('slant range', '', 30, 40.0), ('Distance oblique (m)', '', 30, 40.0),
+        ('range', 'slant', 30, 40.0), ('range', 'horizontal', 30, 50.0),
+        ('horizontal range', '', 30, 50.0), ('range', '', 30, None),
+        ('range', '', 3, 50.0),  # hardly matters
+    ):  # fmt: skip
+        text = f'time,{header},bearing_deg,depth\n1,50,90,{depth}\n2,50,90,{depth}\n'
+        how = {'out': f'{header}{ranges}{depth}', **({'ranges': ranges} if ranges else {})}
+        if x is None:
+            with pytest.raises(BagError, match='say --ranges slant or --ranges horizontal'):
+                convert(text, bearings='north', **how)
+        else:
+            place = measured(convert(text, bearings='north', **how).path)[0].position
+            assert place == pytest.approx([x, 0.0, -depth], abs=0.1 * (depth == 3))

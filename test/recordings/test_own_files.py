@@ -10,22 +10,18 @@
 error reaches the check."""
 
 import json
+import shutil
 
+from helpers.commands import run
 from helpers.dive_bags import write_dive
 import numpy as np
 import pytest
 
+from sonar_imm.acoustics.rays import Profile
 from sonar_imm.parameters import parameters_from_yaml
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm_tools.cli import main
-from sonar_imm_tools.recordings.own_files import (
-    own_limit,
-    own_parameters,
-    own_recipe,
-    unusual,
-    write_own_limit,
-    write_own_parameters,
-)
+from sonar_imm_tools.recordings import own_files
+from sonar_imm_tools.recordings.own_files import own_limit, unusual, write_own_parameters
 from sonar_imm_tools.recordings.sound_speed import mean_speed, MOST_POINTS, read_profile
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.simulation.fathometer.simulator import scenario as fathometer_scenario
@@ -47,10 +43,10 @@ def test_only_what_differs_from_the_defaults_is_told():
 
 def test_the_file_is_one_of_ros(tmp_path):
     assert write_own_parameters(tmp_path, {'obstacle': {}}) is None
-    assert own_parameters(tmp_path) is None
+    assert own_files.own_parameters(tmp_path) is None
     values = {'sonar_lever': (2.0, 0.0, -0.3), 'azimuth_model': 'cone', 'max_range': 50.0}
     path = write_own_parameters(tmp_path, {'obstacle': values, 'fls_detector': {}})
-    assert own_parameters(tmp_path).path == path
+    assert own_files.own_parameters(tmp_path).path == path
     text = path.read_text()
     read = parameters_from_yaml(text, node_name='obstacle')
     assert SYSTEMS['obstacle'].config_type().from_mapping(read).sonar_lever == (2.0, 0.0, -0.3)
@@ -62,12 +58,12 @@ def test_the_file_is_one_of_ros(tmp_path):
 def bag(tmp_path_factory):
     bag = tmp_path_factory.mktemp('own') / 'scene'
     settings = ('--set', 'sonar_lever=2,0,-0.3', '--set', 'last_range=80')
-    assert main(['simulate', 'obstacle', str(bag), *settings]) == 0
+    assert run('simulate', 'obstacle', bag, *settings) == 0
     return bag
 
 
 def parameters_of(bag, folder, *options):
-    assert main(['track', str(bag), str(folder), *options]) == 0
+    assert run('track', bag, folder, *options) == 0
     return json.loads((folder / 'run.json').read_text())['parameters']
 
 
@@ -78,19 +74,14 @@ def test_track_uses_them_unless_told_otherwise(bag, tmp_path, capsys):
     assert changed['sonar_lever'] == [2.0, 0.0, -0.3] and changed['max_tracks'] == 5
     other = tmp_path / 'other.yaml'
     other.write_text('max_tracks: 7\n')
-    given = parameters_of(bag, tmp_path / 'given', '--params', str(other))
-    assert f'--params is used in place of the parameters of the recording, {bag}' in (
-        capsys.readouterr().out
-    )
+    given = parameters_of(bag, tmp_path / 'given', '--params', other)
+    said = f'--params is used in place of the parameters of the recording, {bag}'
+    assert said in capsys.readouterr().out
     assert given['sonar_lever'] == [0.0, 0.0, 0.0] and given['max_tracks'] == 7
-
-
-def test_a_spoilt_file_is_one_sentence(bag, tmp_path, capsys):
-    (tmp_path / 'bag').mkdir()
-    for file in bag.iterdir():
-        (tmp_path / 'bag' / file.name).write_bytes(file.read_bytes())
-    (tmp_path / 'bag' / 'parameters.yaml').write_text('obstacle: {ros__parameters: {levr: 1}}\n')
-    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'out')]) == 2
+    # A spoilt file is one sentence.
+    spoilt = shutil.copytree(bag, tmp_path / 'bag')
+    (spoilt / 'parameters.yaml').write_text('obstacle: {ros__parameters: {levr: 1}}\n')
+    assert run('track', spoilt, tmp_path / 'out') == 2
     assert "unknown parameter 'levr'" in capsys.readouterr().err
 
 
@@ -101,28 +92,25 @@ def test_a_limit_and_how_a_recording_is_made_again_are_kept(tmp_path):
     assert own_limit(tmp_path) is None
     for recipe in (None, [], ['--scenario', 'a scene', '--set', 'fading=']):
         if recipe is not None:
-            write_own_limit(tmp_path, 0.88, recipe)
+            own_files.write_own_limit(tmp_path, 0.88, recipe)
             assert own_limit(tmp_path) == 0.88
         if recipe:
-            assert own_recipe(tmp_path) == recipe
+            assert own_files.own_recipe(tmp_path) == recipe
             continue
         with pytest.raises(BagError, match='does not state how'):
-            own_recipe(tmp_path)
+            own_files.own_recipe(tmp_path)
 
 
-@pytest.mark.parametrize(
-    'text, sentence',
-    [
+def test_any_other_limit_is_one_sentence(tmp_path):
+    for text, sentence in (
         ('limit: ten', 'states no number'), ('limit: true', 'states no number'),
         ('[1, 2]', 'states no number'), ('', 'states no number'), ('limit: .nan', 'finite'),
         ('limit: .inf', 'finite'), ('limit: -1', 'not negative'), ('limit: [', 'not YAML'),
         ('\udcff\udcfe\x00limit', 'not YAML'),
-    ],
-)  # fmt: skip
-def test_any_other_limit_is_one_sentence(tmp_path, text, sentence):
-    (tmp_path / 'check.yaml').write_text(text, errors='surrogateescape')
-    with pytest.raises(BagError, match=sentence):
-        own_limit(tmp_path)
+    ):  # fmt: skip
+        (tmp_path / 'check.yaml').write_text(text, errors='surrogateescape')
+        with pytest.raises(BagError, match=sentence):
+            own_limit(tmp_path)
 
 
 # -- profiles of the speed of sound
@@ -167,10 +155,10 @@ def write(path, rows):
     return path
 
 
-@pytest.mark.parametrize('name', FILES)
-def test_every_format_gives_the_same_profile(tmp_path, name):
-    profile = read_profile(write(tmp_path / name, FILES[name]))
-    assert profile.depth == pytest.approx(DEPTH) and profile.speed == pytest.approx(SPEED)
+def test_every_format_gives_the_same_profile(tmp_path):
+    for name, rows in FILES.items():
+        profile = read_profile(write(tmp_path / name, rows))
+        assert profile.depth == pytest.approx(DEPTH) and profile.speed == pytest.approx(SPEED)
 
 
 def test_duplicates_upcasts_and_spikes_go_and_a_long_cast_keeps_what_it_needs(tmp_path):
@@ -186,36 +174,26 @@ def test_duplicates_upcasts_and_spikes_go_and_a_long_cast_keeps_what_it_needs(tm
     assert np.abs(profile.at(depth) - speed).max() < 0.02
 
 
-def test_the_mean_is_that_of_a_vertical_path():
-    profile = read_profile.__globals__['Profile'](
-        np.array([0.0, 10.0]), np.array([1400.0, 1600.0])
-    )
-    # The integral of 1 / (1400 + 20 z) over 10 m.
-    assert mean_speed(profile) == pytest.approx(200.0 / np.log(1600.0 / 1400.0), rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ('rows', 'word'),
-    [
+def test_what_is_no_profile_is_one_sentence(tmp_path):
+    for rows, word in (
         (['depth,temperature', '1,8'], 'no column of sound speed'),
         (['1 2 3', '4 5 6'], 'columns without names'),
         (['depth,speed', '1,15', '2,16'], 'between 1300 and 1700'),
         ([''], 'no column of depth'),
-    ],
-)
-def test_what_is_no_profile_is_one_sentence(tmp_path, rows, word):
-    with pytest.raises(BagError, match=word):
-        read_profile(write(tmp_path / 'a.csv', rows))
+    ):
+        with pytest.raises(BagError, match=word):
+            read_profile(write(tmp_path / 'a.csv', rows))
     with pytest.raises(BagError, match='cannot be read'):
         read_profile(tmp_path / 'absent.svp')
 
 
 def test_track_takes_the_mean_of_a_profile_for_divers(tmp_path):
+    # That of a vertical path: the integral of 1 / (1400 + 20 z) over 10 m.
+    straight = Profile(np.array([0.0, 10.0]), np.array([1400.0, 1600.0]))
+    assert mean_speed(straight) == pytest.approx(200.0 / np.log(1600.0 / 1400.0), rel=1e-6)
     write_dive(tmp_path / 'bag', count=5)
     path = write(tmp_path / 'a.svp', FILES['caris.svp'])
-    out = tmp_path / 'out'
-    assert main(['track', str(tmp_path / 'bag'), str(out), '--sound-speed', str(path)]) == 0
-    speed = json.loads((out / 'run.json').read_text())['parameters']['sound_speed']
+    speed = parameters_of(tmp_path / 'bag', tmp_path / 'out', '--sound-speed', path)['sound_speed']
     assert speed == pytest.approx(mean_speed(read_profile(path)), abs=1e-3)
-    none = ('--sound-speed', str(tmp_path / 'absent.svp'))
-    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'no'), *none]) == 2
+    none = ('--sound-speed', tmp_path / 'absent.svp')
+    assert run('track', tmp_path / 'bag', tmp_path / 'no', *none) == 2

@@ -20,7 +20,7 @@ import yaml
 
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings import mcap_records
-from sonar_imm_tools.recordings.messages import ros_message, typestore
+from sonar_imm_tools.recordings.messages import cdr_of, ros_message, typestore
 from sonar_imm_tools.recordings.reader import BagError, BagReader
 from sonar_imm_tools.recordings.writer import BagWriter
 
@@ -44,9 +44,24 @@ def read(path, **options):
         return list(bag.messages()), bag.problems
 
 
+def seen(items):
+    return [item.message.pose.pose.position.x for item in items]
+
+
 def cut(path, share):
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
+
+
+def fixes(path, messages, plugin=StoragePlugin.MCAP, mode=CompressionMode.NONE, version=8):
+    """A recording of these fixes by rosbags, one each nanosecond from 10 on."""
+    writer = Writer(path, version=version, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        link = writer.add_connection('/fix', FIX, typestore=typestore())
+        for log_ns, message in enumerate(messages, start=10):
+            writer.write(link, log_ns, cdr_of(message))
+    return path
 
 
 def defined_as(path, definition):
@@ -103,32 +118,26 @@ class TestDefinitions:
         with BagReader(path) as bag:
             assert bag.topics[0].decodable
 
-    @pytest.mark.parametrize('value', ['[{}]', '{{<<: [{}]}}'])
-    def test_metadata_whose_anchors_multiply_are_left_unread(self, write_fixes, value):
-        path = write_fixes(5)
-        metadata = path / 'metadata.yaml'
-        metadata.write_text(multiplying(value) + '\n' + metadata.read_text())
-        before = time.process_time()
-        items, problems = read(path)
-        assert time.process_time() - before < 5.0
-        assert len(items) == 5 and 'its anchors multiply' in problems[0]
+    def test_metadata_whose_anchors_multiply_are_left_unread(self, write_fixes):
+        for value in ('[{}]', '{{<<: [{}]}}'):
+            path = write_fixes(5, name=f'bag{len(value)}')
+            metadata = path / 'metadata.yaml'
+            metadata.write_text(multiplying(value) + '\n' + metadata.read_text())
+            before = time.process_time()
+            items, problems = read(path)
+            assert time.process_time() - before < 5.0
+            assert len(items) == 5 and 'its anchors multiply' in problems[0]
 
 
 class TestWhole:
-    @pytest.mark.parametrize('version, name', [(8, 'dive.bag'), (9, 'dive.v2')])
     @pytest.mark.parametrize('plugin, mode', KINDS)
-    def test_every_kind_of_rosbag2(self, tmp_path, fix_message, plugin, version, name, mode):
+    def test_every_kind_of_rosbag2(self, tmp_path, fix_message, plugin, mode):
         """In folders of any name."""
-        writer = Writer(tmp_path / name, version=version, storage_plugin=plugin)
-        writer.set_compression(mode, CompressionFormat.ZSTD)
-        with writer:
-            link = writer.add_connection('/fix', FIX, typestore=typestore())
-            for i in range(5):
-                writer.write(link, 10 + i, typestore().serialize_cdr(fix_message(i), FIX))
-        items, problems = read(tmp_path / name)
-        assert [item.log_ns for item in items] == [10, 11, 12, 13, 14] and not problems
-        assert [item.message.pose.pose.position.x for item in items] == [0, 1, 2, 3, 4]
-        assert [item.index for item in items] == [0, 1, 2, 3, 4]
+        for version, name in ((8, 'dive.bag'), (9, 'dive.v2')):
+            path = fixes(tmp_path / name, map(fix_message, range(5)), plugin, mode, version)
+            items, problems = read(path)
+            assert [item.log_ns for item in items] == [10, 11, 12, 13, 14] and not problems
+            assert seen(items) == [item.index for item in items] == [0, 1, 2, 3, 4]
 
     @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
     def test_a_bare_file_and_a_directory_without_metadata(self, write_fixes, storage):
@@ -140,20 +149,13 @@ class TestWhole:
         items, problems = read(path)
         assert len(items) == 50 and len(problems) == 1 and 'no metadata.yaml' in problems[0]
 
-    @pytest.mark.parametrize('plugin', list(StoragePlugin))
-    def test_compressed_messages_without_the_metadata_that_tell_of_it(
-        self, tmp_path, fix_message, plugin
+    def test_compressed_ones_without_the_metadata_that_tell_of_it(
+        self, tmp_path, fix_message, write_fixes
     ):
-        writer = Writer(tmp_path / 'bag', version=8, storage_plugin=plugin)
-        writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
-        with writer:
-            link = writer.add_connection('/fix', FIX, typestore=typestore())
-            writer.write(link, 1, typestore().serialize_cdr(fix_message(7), FIX))
-        (tmp_path / 'bag' / 'metadata.yaml').unlink()
-        items, _ = read(tmp_path / 'bag')
-        assert items[0].message.pose.pose.position.x == 7
-
-    def test_a_compressed_file_without_metadata_is_one_sentence(self, write_fixes):
+        for plugin in StoragePlugin:
+            path = fixes(tmp_path / plugin.name, [fix_message(7)], plugin, CompressionMode.MESSAGE)
+            (path / 'metadata.yaml').unlink()
+            assert seen(read(path)[0]) == [7]
         path = write_fixes()
         storage_file(path).rename(path / 'bag.mcap.zstd')
         (path / 'metadata.yaml').unlink()
@@ -161,10 +163,9 @@ class TestWhole:
             read(path)
 
     def test_a_ros_1_bag(self, tmp_path):
-        store = get_typestore(Stores.ROS1_NOETIC)
+        store, kind = get_typestore(Stores.ROS1_NOETIC), 'geometry_msgs/msg/PointStamped'
         types = store.types
         with Writer1(tmp_path / 'old.bag') as writer:
-            kind = 'geometry_msgs/msg/PointStamped'
             link = writer.add_connection('/fix', kind, typestore=store)
             stamp = types['builtin_interfaces/msg/Time'](sec=5, nanosec=7)
             header = types['std_msgs/msg/Header'](seq=1, stamp=stamp, frame_id='map')
@@ -182,42 +183,29 @@ class TestWhole:
                     bag.write('/fix', fix_message(int(number)), log)
             shutil.copy(tmp_path / f's_{number}' / f's_{number}.mcap', split)
         items, _ = read(split)
-        found = [(item.log_ns, item.message.pose.pose.position.x) for item in items]
-        assert found == [(30, 2), (40, 10), (50, 2), (50, 10)]
+        assert [item.log_ns for item in items] == [30, 40, 50, 50]
+        assert seen(items) == [2, 10, 2, 10]
         with BagReader(split) as bag:
             assert [(topic.name, topic.count) for topic in bag.topics] == [('/fix', 4)]
 
 
-class TestOrder:
-    def late(self, tmp_path, fix_message):
-        with BagWriter(tmp_path / 'bag') as bag:
-            for i, log in ((2, 10), (0, 20), (1, 20), (3, 5)):
-                bag.write('/fix', fix_message(i), log)
-            bag.write('/note', ros_message('std_msgs/msg/String', data='no stamp'), 7)
-        return tmp_path / 'bag'
-
-    def test_recorded_order_is_log_time_then_order_of_the_file(self, tmp_path, fix_message):
-        with BagReader(self.late(tmp_path, fix_message)) as bag:
-            order = [item.message.pose.pose.position.x for item in bag.messages(['/fix'])]
-            assert order == [3, 2, 0, 1]
-
-    def test_stamp_order_undoes_lateness(self, tmp_path, fix_message):
-        with BagReader(self.late(tmp_path, fix_message)) as bag:
-            items = list(bag.messages(order='stamp'))
-            assert items[0].topic == '/note'
-            assert [item.message.pose.pose.position.x for item in items[1:]] == [0, 1, 2, 3]
-            assert [item.index for item in items] == [1, 3, 4, 2, 0]
-            with pytest.raises(ValueError, match='recorded, stamp'):
-                next(bag.messages(order='random'))
-
-    def test_without_decoding_the_bytes_remain_and_an_unknown_topic_gives_nothing(
-        self, tmp_path, fix_message
-    ):
-        with BagReader(self.late(tmp_path, fix_message)) as bag:
-            item = next(bag.messages(['/note'], decode=False))
-            assert item.message is None
-            assert typestore().deserialize_cdr(item.raw, item.type_name).data == 'no stamp'
-            assert list(bag.messages(['/other'])) == [] and list(bag.messages([])) == []
+def test_recorded_order_is_log_time_and_stamp_order_undoes_lateness(tmp_path, fix_message):
+    with BagWriter(tmp_path / 'bag') as bag:
+        for i, log in ((2, 10), (0, 20), (1, 20), (3, 5)):
+            bag.write('/fix', fix_message(i), log)
+        bag.write('/note', ros_message('std_msgs/msg/String', data='no stamp'), 7)
+    with BagReader(tmp_path / 'bag') as bag:
+        assert seen(bag.messages(['/fix'])) == [3, 2, 0, 1]  # then the order of the file
+        items = list(bag.messages(order='stamp'))
+        assert items[0].topic == '/note' and seen(items[1:]) == [0, 1, 2, 3]
+        assert [item.index for item in items] == [1, 3, 4, 2, 0]
+        with pytest.raises(ValueError, match='recorded, stamp'):
+            next(bag.messages(order='random'))
+        # Without decoding the bytes remain, and an unknown topic gives nothing.
+        item = next(bag.messages(['/note'], decode=False))
+        assert item.message is None
+        assert typestore().deserialize_cdr(item.raw, item.type_name).data == 'no stamp'
+        assert list(bag.messages(['/other'])) == [] and list(bag.messages([])) == []
 
 
 class TestDamage:
@@ -235,17 +223,14 @@ class TestDamage:
             with pytest.raises(BagError), BagReader(target, strict=True):
                 pass
 
-    @pytest.mark.parametrize('share', [0.0, 0.2, 0.9])
-    def test_a_truncated_db3_is_one_sentence(self, write_fixes, share):
-        path = write_fixes(500, storage='sqlite3')
-        cut(storage_file(path), share)
-        with pytest.raises(BagError, match='sqlite3 bag.db3 .recover') as caught:
-            read(path)
-        assert '\n' not in caught.value.sentence
-
-    def test_the_end_of_a_db3_that_is_missing_is_a_problem(self, write_fixes):
-        path = write_fixes(500, storage='sqlite3')
-        data = storage_file(path).read_bytes()
+    def test_a_truncated_db3_is_one_sentence_and_one_without_its_end_a_problem(self, write_fixes):
+        for share in (0.0, 0.2, 0.9):
+            path = write_fixes(500, name=f'bag{share}', storage='sqlite3')
+            data = storage_file(path).read_bytes()
+            cut(storage_file(path), share)
+            with pytest.raises(BagError, match=r'sqlite3 bag.*db3 .recover') as caught:
+                read(path)
+            assert '\n' not in caught.value.sentence
         storage_file(path).write_bytes(data[: len(data) - 1000])
         items, problems = read(path)
         if len(items) == 500:
@@ -263,15 +248,12 @@ class TestDamage:
         for target in (path, path / 'bag.db3'):
             items, problems = read(target)
             assert len(items) == 3 and 'bag.db3-wal holds 100 bytes' in problems[0]
-
-    def test_a_real_write_ahead_log_hides_rows_from_the_reader(self, write_fixes):
-        path = write_fixes(3, storage='sqlite3')
+        log.unlink()
         recorder = sqlite3.connect(path / 'bag.db3')
         recorder.execute('pragma journal_mode=wal')
         recorder.execute("insert into messages (topic_id, timestamp, data) values (1, 9, x'00')")
         recorder.commit()
-        copy = path.parent / 'crashed'
-        shutil.copytree(path, copy)
+        copy = shutil.copytree(path, path.parent / 'crashed')
         recorder.close()
         items, problems = read(copy)
         assert len(items) == 3 and 'not read' in problems[0]
@@ -279,11 +261,10 @@ class TestDamage:
     def test_a_flipped_bit_costs_one_message_not_the_bag(self, tmp_path, fix_message):
         with BagWriter(tmp_path / 'bag') as bag:
             for i in range(5):
-                raw = bytearray(typestore().serialize_cdr(fix_message(i), FIX))
-                topic = '/other' if i == 4 else '/fix'
+                raw = bytearray(cdr_of(fix_message(i)))
                 if i in (1, 3, 4):
                     raw[12:16] = struct.pack('<I', 2**31)  # length of frame_id
-                bag.write_raw(topic, FIX, bytes(raw), i)
+                bag.write_raw('/other' if i == 4 else '/fix', FIX, bytes(raw), i)
         items, problems = read(tmp_path / 'bag')
         assert [item.index for item in items] == [0, 2]
         given = '/fix: 2 messages could not be decoded (the first: message 1,'
@@ -339,20 +320,18 @@ class TestTypes:
                 database.execute(f'delete from message_definitions where topic_type {gone}')
             database.close()
 
-    def test_a_type_defined_in_the_bag_is_read(self, tmp_path):
-        self.add_custom(tmp_path / 'bag')
-        items, problems = read(tmp_path / 'bag')
-        assert items[0].message.value == 2.5 and not problems
-
-    @pytest.mark.parametrize(
-        'gone, topics', [("like '%'", ['/text']), ("like 'std_msgs%'", ['/custom', '/text'])]
-    )
-    def test_a_known_type_needs_no_definition(self, tmp_path, gone, topics):
+    def test_a_type_defined_in_the_bag_is_read_and_a_known_one_needs_no_definition(self, tmp_path):
         """Where none is in the bag, and where only those of other types are."""
-        self.add_custom(tmp_path / 'bag', gone)
-        items, problems = read(tmp_path / 'bag')
-        assert [item.topic for item in items] == topics
-        assert CUSTOM in problems[0] if len(topics) == 1 else not problems
+        both = ['/custom', '/text']
+        for gone, topics in (('', both), ("like '%'", both[1:]), ("like 'std_msgs%'", both)):
+            path = tmp_path / f'bag{len(gone)}'
+            self.add_custom(path, gone)
+            items, problems = read(path)
+            assert [item.topic for item in items] == topics
+            if topics == both:
+                assert items[0].message.value == 2.5 and not problems
+            else:
+                assert CUSTOM in problems[0]
 
     def test_an_undefined_type_is_told_and_the_rest_is_read(self, tmp_path):
         self.add_custom(tmp_path / 'bag', f"= '{CUSTOM}'")
@@ -365,62 +344,52 @@ class TestTypes:
             assert 'could not be decoded' in bag.problems[1]
 
 
-@pytest.mark.parametrize(
-    'place, value, sentence',
-    [
-        ((TOPICS, 0, 'message_count'), 'many', 'message count of many'),
-        ((TOPICS, 0, 'message_count'), -5, 'message count of -5'),
-        ((TOPICS, 0, 'message_count'), 10**20, 'count of 100000000000000000000'),
-        ((TOPICS, 0, 'message_count'), 1e20, 'message count of 1e+20'),
-        ((TOPICS, 0, 'topic_metadata', 'name'), [5], 'is no text'),
-        ((TOPICS, 0, 'topic_metadata', 'name'), 5, 'is no text'),
+COUNT, NAME = (TOPICS, 0, 'message_count'), (TOPICS, 0, 'topic_metadata', 'name')
+
+
+def test_metadata_of_a_wrong_kind_are_told_and_the_files_are_read(write_fixes):
+    path = write_fixes(3)
+    text = (path / 'metadata.yaml').read_text()
+    for place, value, sentence in (
+        (COUNT, 'many', 'message count of many'),
+        (COUNT, -5, 'message count of -5'),
+        (COUNT, 10**20, 'count of 100000000000000000000'),
+        (COUNT, 1e20, 'message count of 1e+20'),
+        (NAME, [5], 'is no text'),
+        (NAME, 5, 'is no text'),
         (('files',), 'none', 'a list of files that is none'),
         ((), '{[', ''),
-    ],
-)
-def test_metadata_of_a_wrong_kind_are_told_and_the_files_are_read(
-    write_fixes, place, value, sentence
-):
-    path = write_fixes(3)
-    metadata = yaml.safe_load((path / 'metadata.yaml').read_text())
-    inside = metadata['rosbag2_bagfile_information']
-    for key in place[:-1]:
-        inside = inside[key]
-    if place:
-        inside[place[-1]] = value
-    (path / 'metadata.yaml').write_text(yaml.safe_dump(metadata) if place else value)
-    items, problems = read(path)
-    assert len(items) == 3 and '\n' not in problems[0]
-    assert sentence in problems[0]
+    ):
+        metadata = yaml.safe_load(text)
+        inside = metadata['rosbag2_bagfile_information']
+        for key in place[:-1]:
+            inside = inside[key]
+        if place:
+            inside[place[-1]] = value
+        (path / 'metadata.yaml').write_text(yaml.safe_dump(metadata) if place else value)
+        items, problems = read(path)
+        assert len(items) == 3 and '\n' not in problems[0]
+        assert sentence in problems[0]
 
 
-@pytest.mark.parametrize('storage, held', [('mcap', 0), ('mcap', 4), ('sqlite3', 4)])
+@pytest.mark.parametrize('storage, held', [('MCAP', 0), ('MCAP', 4), ('SQLITE3', 4)])
 def test_an_index_that_speaks_of_more_messages_is_told(
     tmp_path, fix_message, storage, held, capsys
 ):
-    path = tmp_path / 'bag'
-    writer = Writer(path, version=8, storage_plugin=StoragePlugin[storage.upper()])
-    with writer:
-        link = writer.add_connection('/fix', FIX, typestore=typestore())
-        for i in range(held):
-            writer.write(link, 10 + i, typestore().serialize_cdr(fix_message(i), FIX))
+    path = fixes(tmp_path / 'bag', map(fix_message, range(held)), StoragePlugin[storage])
     text = (path / 'metadata.yaml').read_text().replace(f'count: {held}', 'count: 101')
     (path / 'metadata.yaml').write_text(text)
     sentence = f'topic /fix holds {held} messages; the index of {path} says 101'
     assert sentence in read(path)[1]
     with pytest.raises(BagError, match='says 101'):
         read(path, strict=True)
-    codes = (1, 1) if not held else (0, 0)
-    commands = (['info', str(path)], ['track', str(path), str(tmp_path / 'out')])
-    for words, code in zip(commands, codes):
-        assert main(words) == code
+    for words in (['info', str(path)], ['track', str(path), str(tmp_path / 'out')]):
+        assert main(words) == (0 if held else 1)
         assert f'problem: {sentence}' in capsys.readouterr().out
 
 
 def test_statistics_of_a_file_that_speak_of_more_messages_are_told(tmp_path):
-    with Writer(tmp_path / 'none', version=8, storage_plugin=StoragePlugin.MCAP) as writer:
-        writer.add_connection('/fix', FIX, typestore=typestore())
-    file = storage_file(tmp_path / 'none')
+    file = storage_file(fixes(tmp_path / 'none', []))
     content = bytearray(file.read_bytes())
     with file.open('rb') as opened:
         summary = mcap_records.footer_of(opened, len(content)).summary

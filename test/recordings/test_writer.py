@@ -22,15 +22,21 @@ from sonar_imm.measurements import Fix
 from sonar_imm.truth import Received, Scene, TrueReflectors, TrueTrack, TruthTable
 from sonar_imm_tools.recordings import csv_writer
 from sonar_imm_tools.recordings.csv_writer import CsvWriter, FEW_ROWS, ROWS_IN_A_BLOCK
-from sonar_imm_tools.recordings.messages import decode_cdr, ros_message, typestore
+from sonar_imm_tools.recordings.messages import cdr_of, decode_cdr, ros_message, typestore
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.recordings.truth import records_of, write_scene
 from sonar_imm_tools.recordings.writer import BagWriter
 
 
+def content(path):
+    with BagReader(path) as bag:
+        assert not bag.problems
+        return [(item.topic, item.log_ns, bytes(item.raw)) for item in bag.messages()]
+
+
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_the_same_input_gives_the_same_bytes_of_every_file(tmp_path, write_fixes, storage):
+def test_the_same_input_gives_the_same_bytes_of_every_file(write_fixes, storage):
     first = write_fixes(name='one/bag', storage=storage, custom_data={'b': '2', 'a': '1'})
     second = write_fixes(name='two/bag', storage=storage, custom_data={'a': '1', 'b': '2'})
     names = sorted(file.name for file in first.iterdir())
@@ -49,12 +55,6 @@ def test_what_is_written_is_read(write_fixes, n, storage):
 
 def test_a_compressed_bag_is_smaller_and_says_the_same(write_fixes):
     paths = [write_fixes(200, name=name, compressed=name == 'packed') for name in ('a', 'packed')]
-
-    def content(path):
-        with BagReader(path) as bag:
-            assert not bag.problems
-            return [(item.topic, item.log_ns, bytes(item.raw)) for item in bag.messages()]
-
     plain, packed = map(content, paths)
     assert plain == packed and len(plain) == 200
     sizes = [(path / f'{path.name}.mcap').stat().st_size for path in paths]
@@ -71,52 +71,38 @@ def test_the_metadata_are_of_version_8_with_the_offered_qos(write_fixes):
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 def test_a_bag_is_there_as_a_whole_or_not_at_all(tmp_path, fix_message, storage):
-    values = {'diver': {'detection_probability': 0.8}}
-    with pytest.raises(KeyboardInterrupt), BagWriter(tmp_path / 'bag', storage=storage) as bag:
+    values, path = {'diver': {'detection_probability': 0.8}}, tmp_path / 'bag'
+    with pytest.raises(KeyboardInterrupt), BagWriter(path, storage=storage) as bag:
         bag.write('/fix', fix_message(0), 5)
         raise KeyboardInterrupt
     assert not any(tmp_path.iterdir())
-    with BagWriter(tmp_path / 'bag', storage=storage, parameters=values) as bag:
+    with BagWriter(path, storage=storage, parameters=values) as bag:
         bag.write('/fix', fix_message(0), 5)
-        assert not (tmp_path / 'bag').exists()
-    assert (tmp_path / 'bag' / 'parameters.yaml').is_file()
-    assert [path.name for path in tmp_path.iterdir()] == ['bag']
-    with BagReader(tmp_path / 'bag') as bag:
-        assert len(list(bag.messages())) == 1 and not bag.problems
-
-
-def test_an_existing_target_is_left_alone(write_fixes, tmp_path):
-    path = write_fixes(3)
+        assert not path.exists()
+        with pytest.raises(ValueError, match='log time'):
+            bag.write('/fix', fix_message(0), -1)
+    assert (path / 'parameters.yaml').is_file() and list(tmp_path.iterdir()) == [path]
+    assert len(content(path)) == 1
+    # What is there is left alone.
     with pytest.raises(BagError, match='exists already'):
         BagWriter(path)
-    with BagReader(path) as bag:
-        assert bag.topics[0].count == 3
+    assert len(content(path)) == 1
     (tmp_path / 'file').write_text('x')
     with pytest.raises(BagError, match='cannot be written|exists'):
         BagWriter(tmp_path / 'file' / 'bag')
-
-
-def test_programming_errors_are_told(tmp_path, fix_message):
     with pytest.raises(ValueError, match='mcap, sqlite3'):
-        BagWriter(tmp_path / 'bag', storage='zip')
-    with BagWriter(tmp_path / 'bag') as bag, pytest.raises(ValueError, match='log time'):
-        bag.write('/fix', fix_message(0), -1)
+        BagWriter(tmp_path / 'other', storage='zip')
 
 
 def test_every_common_message_can_be_made_empty_and_survives_cdr():
-    for name in typestore().types:
-        if '/msg/' not in name:
-            continue
-        message = ros_message(name)
-        raw = bytes(typestore().serialize_cdr(message, name))
-        again = decode_cdr(typestore(), name, raw)
-        assert bytes(typestore().serialize_cdr(again, name)) == raw, name
+    for name in (name for name in typestore().types if '/msg/' in name):
+        raw = cdr_of(ros_message(name))
+        assert cdr_of(decode_cdr(typestore(), name, raw)) == raw, name
 
 
 def test_fields_are_cast_strictly():
-    message = ros_message(
-        'sensor_msgs/msg/JointState', name=('a',), position=[1, 2], velocity=np.float32([0.5])
-    )
+    fields = {'name': ('a',), 'position': [1, 2], 'velocity': np.float32([0.5])}
+    message = ros_message('sensor_msgs/msg/JointState', **fields)
     assert message.position.dtype == np.float64 and message.velocity.dtype == np.float64
     cloud = ros_message('sensor_msgs/msg/PointCloud2', data=b'\x01\x02', height=np.int64(3))
     assert cloud.data.tolist() == [1, 2] and type(cloud.height) is int
@@ -128,13 +114,12 @@ def test_fields_are_cast_strictly():
 
 def test_spare_alignment_bytes_are_no_damage_but_damage_is():
     name = 'sensor_msgs/msg/JointState'
-    raw = bytes(typestore().serialize_cdr(ros_message(name, position=[2.5]), name))
+    raw = cdr_of(ros_message(name, position=[2.5]))
     for spare in (0, 4, 8, 12):
         assert decode_cdr(typestore(), name, raw + bytes(spare)).position.tolist() == [2.5]
-    with pytest.raises(Exception, match='size mismatch'):
-        decode_cdr(typestore(), name, raw + bytes(100))
-    with pytest.raises(Exception, match='JointState'):
-        decode_cdr(typestore(), name, raw[:20])
+    for damaged, words in ((raw + bytes(100), 'size mismatch'), (raw[:20], 'JointState')):
+        with pytest.raises(Exception, match=words):
+            decode_cdr(typestore(), name, damaged)
 
 
 # -- tables of numbers as CSV: the same bytes whatever writes them
@@ -171,14 +156,6 @@ def plain(columns):
     return file.getvalue()
 
 
-@pytest.fixture
-def without_pyarrow(monkeypatch):
-    monkeypatch.setitem(sys.modules, 'pyarrow', None)
-    csv_writer._arrow.cache_clear()
-    yield
-    csv_writer._arrow.cache_clear()
-
-
 @pytest.mark.filterwarnings('ignore:overflow encountered')
 @pytest.mark.parametrize('name', HOSTILE)
 def test_numbers_have_the_digits_of_python(name):
@@ -193,25 +170,28 @@ def test_blocks_follow_one_another(rows):
     assert written(columns) == plain(columns)
 
 
+@pytest.fixture
+def choose_again():
+    csv_writer._arrow.cache_clear()
+    yield
+    csv_writer._arrow.cache_clear()
+
+
 def test_pyarrow_writes_them_where_it_is_there():
     pytest.importorskip('pyarrow')
     assert csv_writer._arrow() is not None
 
 
-def test_the_same_bytes_without_pyarrow(without_pyarrow):
+@pytest.mark.parametrize('digits', ['none', 'others'])
+def test_the_same_bytes_without_pyarrow_or_one_of_other_digits(monkeypatch, choose_again, digits):
+    if digits == 'none':
+        monkeypatch.setitem(sys.modules, 'pyarrow', None)
+    else:
+        pytest.importorskip('pyarrow')
+        other = '_texts', lambda column, arrow: arrow.array(['1'] * len(column))
+        monkeypatch.setattr(csv_writer, *other)
     assert csv_writer._arrow() is None
     assert written([SPREAD, SPREAD]) == plain([SPREAD, SPREAD])
-
-
-def test_a_pyarrow_with_other_digits_is_not_used(monkeypatch):
-    pytest.importorskip('pyarrow')
-    monkeypatch.setattr(
-        csv_writer, '_texts', lambda column, arrow: arrow.array(['1'] * len(column))
-    )
-    csv_writer._arrow.cache_clear()
-    assert csv_writer._arrow() is None
-    assert written([SPREAD]) == plain([SPREAD])
-    csv_writer._arrow.cache_clear()
 
 
 # -- scenes become bags: each class by its own writer, in the order of reception
@@ -230,27 +210,26 @@ def logged(path):
 
 
 def test_late_measurements_are_recorded_when_they_were_received(tmp_path):
-    scene = Scene(
-        (Received(START_NS + 9, fix(1)), Received(START_NS + 4, fix(3))),
-        (TrueTrack(7, START_NS + np.array([2, 6]), np.zeros((2, 3)), np.ones((2, 2))),),
-    )
-    report = write_scene(scene, tmp_path / 'bag', provenance={})
-    assert report.messages == {'/fix': 2, '/truth/estimate': 2}
-    truth = '/truth/estimate'
-    assert logged(tmp_path / 'bag') == [(truth, 2), ('/fix', 4), (truth, 6), ('/fix', 9)]
-
-
-def test_a_scene_may_know_other_truth_of_its_own(tmp_path):
     @frozen
     class Buoy:
+        """Other truth that a scene may know."""
+
         stamp_ns: int
 
         def tables(self, frame_id):
             yield TruthTable(self.stamp_ns, frame_id, {'x': np.zeros(1, np.float32)}, 'north')
 
-    scene = Scene((Received(START_NS + 1, fix(0), 'south'),), (Buoy(START_NS + 2),))
-    write_scene(scene, tmp_path / 'bag', provenance={})
-    assert logged(tmp_path / 'bag') == [('/south/fix', 1), ('/truth/north/estimate', 2)]
+    received = (9, fix(1)), (4, fix(3)), (1, fix(0), 'south')
+    track = TrueTrack(7, START_NS + np.array([2, 6]), np.zeros((2, 3)), np.ones((2, 2)))
+    scene = Scene(
+        tuple(Received(START_NS + at, *what) for at, *what in received),
+        (track, Buoy(START_NS + 2)),
+    )
+    report = write_scene(scene, tmp_path / 'bag', provenance={})
+    truth, north = '/truth/estimate', '/truth/north/estimate'
+    assert report.messages == {'/fix': 2, '/south/fix': 1, truth: 2, north: 1}
+    wanted = [('/south/fix', 1), (truth, 2), (north, 2), ('/fix', 4), (truth, 6), ('/fix', 9)]
+    assert logged(tmp_path / 'bag') == wanted
 
 
 def test_a_true_track_is_a_table_at_each_stamp():

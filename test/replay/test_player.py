@@ -11,7 +11,6 @@
 import contextlib
 import os
 import threading
-import time
 from types import SimpleNamespace
 
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
@@ -94,11 +93,20 @@ def test_a_stretch_without_a_topic_and_with_another_quality_of_service(bag, link
     assert [round(message.pose.pose.position.x) for message in ear.received] == list(range(5, 16))
 
 
-def test_the_pace_follows_the_log_times(bag, link, domain):
-    Ear(link, PoseWithCovarianceStamped, '/fix')
-    start = time.monotonic()
-    play(bag, PlayOptions(rate=0.5, topics=('/fix',)), domain_id=domain)
-    assert time.monotonic() - start >= (COUNT - 1) * STEP / 1e9 / 0.5
+def test_the_pace_follows_the_log_times(bag, domain, monkeypatch):
+    """By a clock that only waiting moves."""
+    clock, due = SimpleNamespace(monotonic=lambda: clock.now, now=1000.0), []
+
+    def wait(seconds):
+        clock.now += seconds
+
+    monkeypatch.setattr(player_module, '_FIRST_LISTENER', 0.0)
+    monkeypatch.setattr(player_module, 'time', clock)
+    with BagReader(bag) as reader, Link(NAME, domain_id=domain) as peer:
+        monkeypatch.setattr(peer, 'spin', wait)
+        player = Player(reader, peer, PlayOptions(rate=0.5, topics=('/fix',)))
+        player.run(lambda _: due.append(clock.now))
+    assert len(due) == COUNT and np.diff(due) == pytest.approx(STEP / 1e9 / 0.5)
 
 
 def test_playing_to_nobody_is_noticed(bag, domain, monkeypatch):

@@ -17,13 +17,9 @@ import pytest
 @pytest.fixture(autouse=True, scope='session')
 def _signals_are_heeded():
     """A run in the background of a script ignores SIGINT, under nohup SIGHUP; so would nodes."""
-    asking = (signal.SIGINT, signal.SIGHUP, signal.SIGTERM)
-    ignored = [number for number in asking if signal.getsignal(number) is signal.SIG_IGN]
-    for number in ignored:
-        signal.signal(number, signal.SIG_DFL)
-    yield
-    for number in ignored:
-        signal.signal(number, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
 
 
 @pytest.fixture(autouse=True, scope='session')

@@ -6,7 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What the hardest messages may cost, each in a process of its own: docs/reliability.md.
+"""What the hardest messages may cost, each in a process of its own, for its peak of memory is one
+of a process: docs/reliability.md.
 
 The limits are a few times what was measured there: a loaded machine must not fail, what grows with
 the square of a message must.
@@ -28,8 +29,6 @@ LIMITS = {
 
 @pytest.mark.parametrize('name', CASES)
 def test_the_hardest_message_of_each_kind_is_bounded(name):
-    given = measured(name)
-    seconds, megabytes = LIMITS[name]
-    assert not given['refused']
-    assert 0.0 < given['cpu_s'] < seconds
+    given, (seconds, megabytes) = measured(name), LIMITS[name]
+    assert not given['refused'] and 0.0 < given['cpu_s'] < seconds
     assert given['memory_mb'] < megabytes

@@ -6,23 +6,36 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The real diver node as a process: exit codes, signals, what it is told at its start, its log.
+"""Real nodes as processes: exit codes, signals, what they are told at their start, their log; and
+their kernels, with the defaults, from an empty folder or a damaged one.
 
-All of that is of a process alone; kernels of the other nodes: test_cold_start.py.
+All of that is of a process alone; what is compiled or loaded stays so in a process of tests.
 """
 
+import contextlib
 import os
+from pathlib import Path
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import time
 
+from diagnostic_msgs.msg import DiagnosticArray
 from helpers.faults.cases import BAGS, CASES
 from helpers.faults.rig import own_words, Rig, wait_until_ready
 import pytest
+from rcl_interfaces.srv import GetParameters
 
-from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id, run_lockstep
-from sonar_imm_tools.replay.link import LinkError
+from sonar_imm.nodes.qos import output_qos
+from sonar_imm_tools.replay.harness import (
+    local_discovery,
+    NodeProcess,
+    reserved_domain_id,
+    run_lockstep,
+)
+from sonar_imm_tools.replay.link import Link, LinkError
 
 pytestmark = pytest.mark.system
 
@@ -30,44 +43,21 @@ pytestmark = pytest.mark.system
 def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(tmp_path):
     file = tmp_path / 'diver.yaml'
     file.write_text('/**:\n  ros__parameters:\n    sound_speed: 1500\n')
-    with pytest.raises(
-        LinkError,
-        match=r"exit code 2: diver: parameter 'sound_speed' is a "
-        r'double: write 1500\.0 instead of 1500',
-    ):
+    sentence = "parameter 'sound_speed' is a double: write 1500.0 instead of 1500"
+    with pytest.raises(LinkError, match=f'exit code 2: diver: {sentence}'):
         run_lockstep(BAGS / 'diver_table1', 'diver', params_file=file)
 
 
-@pytest.mark.parametrize(
-    'arguments, sentence',
-    [
-        (('-p', 'sound_speed:=1500'), 'write 1500.0 instead of 1500'),
-        (('-p', 'depth_min:=90.0'), 'depth_min (90) cannot exceed depth_max (20)'),
-        (('--params-file', 'nowhere.yaml'), "Couldn't parse params file"),
-        (('--no-such-flag',), '--no-such-flag'),
-        (('--', '-p', 'sound_speed:=1500.0'), "'-p' has to follow --ros-args"),
-    ],
-)
-def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence):
+def test_unusable_arguments_end_in_one_line_and_exit_code_2():
+    arguments = '--params-file', 'nowhere.yaml'
     with (
         reserved_domain_id() as domain,
         NodeProcess('diver', domain_id=domain, arguments=arguments) as node,
     ):
         assert node.process.wait(600.0) == 2
-        own = ('[rcl]', 'kernels')
-        message = own_words(node.log()).splitlines()
-        lines = [line for line in message if not any(word in line for word in own)]
-    assert len(lines) == 1
-    assert sentence in lines[0]
-
-
-def assert_clean_end(nodes, how):
-    for node in nodes:
-        node.process.send_signal(how)
-    for node in nodes:
-        assert node.process.wait(600.0) == 0, node.log()
-        message = own_words(node.log())
-        assert 'Traceback' not in message and 'Error' not in message
+        said = own_words(node.log()).splitlines()
+        (line,) = (line for line in said if '[rcl]' not in line and 'kernels' not in line)
+    assert "Couldn't parse params file" in line
 
 
 def test_a_node_under_nohup_outlives_its_terminal():
@@ -82,27 +72,19 @@ def test_a_node_under_nohup_outlives_its_terminal():
             node.process.send_signal(signal.SIGHUP)
             with pytest.raises(subprocess.TimeoutExpired):
                 node.process.wait(0.5)
-            assert_clean_end([node], signal.SIGTERM)
+            node.process.send_signal(signal.SIGTERM)
+            assert node.process.wait(600.0) == 0, node.log()
 
 
-def test_modules_of_the_nodes_load_neither_scipy_nor_numba():
+def test_help_is_said_and_the_module_loaded_without_what_takes_long():
     code = (
-        'import sys, sonar_imm.nodes.diver; '
-        'print([m for m in ("numba", "scipy", "rosbags", "plotly") if m in sys.modules])'
+        'import atexit, sys, sonar_imm.nodes.diver as node\n'
+        'words = ("numba", "scipy", "rosbags", "plotly")\n'
+        'print([m for m in words if m in sys.modules], flush=True)\n'
+        'sys.argv = ["diver", "--help"]\nsys.exit(node.main())'
     )
-    printed = subprocess.run(
-        [sys.executable, '-c', code], capture_output=True, text=True, check=True
-    )
-    assert printed.stdout.strip() == '[]'
-
-
-def test_help_is_said_without_starting():
-    with (
-        reserved_domain_id() as domain,
-        NodeProcess('diver', domain_id=domain, arguments=('--', '--help')) as node,
-    ):
-        assert node.process.wait(600.0) == 0
-        assert node.log().startswith('usage: diver [--ros-args')
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.startswith('[]\nusage: diver [--ros-args')
 
 
 # -- its log: a memory card is taken out, a disk is full --
@@ -139,55 +121,76 @@ def test_a_node_outlives_a_full_disk_below_its_log(tmp_path, monkeypatch):
         subprocess.run(['umount', str(tmp_path)], check=True)
 
 
-# -- a node that is to be secured, and cannot be, does not start without security --
-# The Fast DDS of the wheels of PyPI has no security plugins, which the node then says.
+@pytest.mark.parametrize(
+    'name, words',
+    [('diver', "doesn't have the security libraries"), ('nobody', "nobody' does not exist")],
+)
+def test_what_cannot_be_secured_does_not_start(name, words, tmp_path):
+    """The Fast DDS of the wheels of PyPI has no security plugins, and others refuse empty keys."""
+    enclave = tmp_path / 'enclaves' / 'sonar_imm' / 'diver'
+    enclave.mkdir(parents=True)
+    keys = 'identity_ca.cert.pem', 'cert.pem', 'key.pem', 'permissions_ca.cert.pem'
+    for file in (*keys, 'governance.p7s', 'permissions.p7s'):
+        (enclave / file).touch()
+    command = [sys.executable, '-m', 'sonar_imm.nodes.diver', '--ros-args', '-e']
+    with reserved_domain_id() as domain:
+        environment = {
+            **os.environ, 'ROS_DOMAIN_ID': str(domain), 'ROS_SECURITY_KEYSTORE': str(tmp_path),
+            'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'Enforce',
+        }  # fmt: skip
+        command.append(f'/sonar_imm/{name}')
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    message = own_words(done.stderr)
+    assert done.returncode == 2 and 'Traceback' not in message and 'ready' not in message
+    assert words in message or (name == 'diver' and 'libraries' not in message)
 
-RULES = '<?xml version="1.0" encoding="utf-8"?><dds><domain_access_rules/></dds>'
+
+LIMIT = 240.0
 
 
 @pytest.fixture
-def keystore(tmp_path):
-    """Keys as `ros2 security create_keystore` and `create_enclave` lay them out."""
-    if shutil.which('openssl') is None:
-        pytest.skip('openssl is not installed')
-    enclave, rules = tmp_path / 'keys' / 'enclaves' / 'sonar_imm' / 'diver', tmp_path / 'rules.xml'
-    enclave.mkdir(parents=True)
-    rules.write_text(RULES)
-    authority, key = tmp_path / 'ca.cert.pem', tmp_path / 'ca.key.pem'
-    curve = ['-newkey', 'ec', '-pkeyopt', 'ec_paramgen_curve:prime256v1', '-nodes', '-days', '9']
-    signed_by = ['-signer', authority, '-inkey', key]
-    for words in (
-        ['req', '-x509', *curve, '-subj', '/CN=sros2CA', '-keyout', key, '-out', authority],
-        [
-            *('req', '-x509', *curve, '-subj', '/CN=diver', '-CA', authority, '-CAkey', key),
-            *('-keyout', enclave / 'key.pem', '-out', enclave / 'cert.pem'),
-        ],
-        ['smime', '-sign', '-text', '-in', rules, '-out', enclave / 'governance.p7s', *signed_by],
-        ['smime', '-sign', '-text', '-in', rules, '-out', enclave / 'permissions.p7s', *signed_by],
-    ):
-        subprocess.run(['openssl', *words], check=True, capture_output=True)
-    for name in ('identity_ca.cert.pem', 'permissions_ca.cert.pem'):
-        shutil.copy(authority, enclave / name)
-    return tmp_path / 'keys'
+def start(tmp_path, monkeypatch):
+    """Starts a node that keeps its kernels in a folder of its own; gives it and a link."""
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'kernels'))
+    with contextlib.ExitStack() as stack:
+        domain = stack.enter_context(reserved_domain_id())
+        stack.enter_context(local_discovery())
+        link = stack.enter_context(Link('asks', domain_id=domain))
+        yield lambda system: (stack.enter_context(NodeProcess(system, domain_id=domain)), link)
 
 
-@pytest.mark.parametrize('enclave', ['/sonar_imm/diver', '/sonar_imm/nobody'])
-def test_what_cannot_be_secured_does_not_start(keystore, enclave):
-    with reserved_domain_id() as domain:
-        environment = {
-            **os.environ, 'ROS_DOMAIN_ID': str(domain), 'ROS_SECURITY_KEYSTORE': str(keystore),
-            'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'Enforce',
-        }  # fmt: skip
-        command = [sys.executable, '-m', 'sonar_imm.nodes.diver', '--ros-args', '-e', enclave]
-        try:
-            done = subprocess.run(
-                command, env=environment, capture_output=True, text=True, timeout=240.0
-            )
-        except subprocess.TimeoutExpired:
-            pytest.skip('this Fast DDS has the security plugins, and the node runs')
-    message = own_words(done.stderr)
-    assert done.returncode == 2 and 'Traceback' not in message and 'ready' not in message
-    if enclave.endswith('nobody'):
-        assert "nobody' does not exist" in message
-    else:
-        assert "doesn't have the security libraries" in message
+def wait_for(node, link, predicate):
+    assert link.wait_for(predicate, LIMIT, node.trouble), node.log()
+
+
+def test_a_node_answers_and_reports_while_it_compiles(start):
+    node, link = start('bathymetry')
+    reports, answers, longest, begun = [], [], 0.0, time.monotonic()
+    link.node.create_subscription(DiagnosticArray, '/diagnostics', reports.append, output_qos())
+    client = link.node.create_client(GetParameters, '/bathymetry/get_parameters')
+
+    def compiles():
+        sentences = [status.message for report in reports for status in report.status]
+        return 'loading kernels, no input is heard until then' in sentences
+
+    wait_for(node, link, client.service_is_ready)
+    for _ in range(3):
+        del reports[:]
+        wait_for(node, link, compiles)
+        asked = time.monotonic()
+        request = GetParameters.Request(names=['frame_id'])
+        client.call_async(request).add_done_callback(answers.append)
+        wait_for(node, link, lambda: answers and answers.pop())
+        longest = max(longest, time.monotonic() - asked)
+    assert 'ready, hears' not in node.log()
+    wait_for(node, link, lambda: 'ready, hears' in node.log())
+    assert longest < 0.25 * (time.monotonic() - begun)  # however slow the machine is
+    assert re.search(r'loading kernels.*\n.*[1-9] kernels compiled, 0 loaded', node.log())
+
+
+def test_a_node_without_kernels_loads_no_numba(start):
+    node, link = start('obstacle')
+    wait_for(node, link, lambda: 'ready, hears' in node.log())
+    maps = Path(f'/proc/{node.process.pid}/maps').read_text()
+    assert 'numpy' in maps and 'llvmlite' not in maps
+    assert 'kernels' not in node.log()

@@ -25,6 +25,7 @@ from helpers.forked import commands
 from helpers.source import commits, ROOT
 import pytest
 
+from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.replay.harness import reserved_domain_id
 
 pytestmark = pytest.mark.system
@@ -49,9 +50,8 @@ LONGEST = 600.0
 
 def blocks(page):
     """Commands and what they print, which is '' where the page does not show it."""
-    found = re.findall(r'^```(bash|text)\n(.*?)^```$', page, re.MULTILINE | re.DOTALL)
     given = []
-    for kind, text in found:
+    for kind, text in re.findall(r'^```(bash|text)\n(.*?)^```$', page, re.M | re.S):
         if kind == 'bash':
             given.append((text, ''))
         else:
@@ -72,9 +72,8 @@ def same(shown, printed):
 
 def near(shown, printed):
     digits = len(shown.partition('.')[2])
-    return math.isclose(
-        float(shown), float(printed), rel_tol=0.05, abs_tol=1.01 * 10.0**-digits if digits else 0.0
-    )
+    last = 1.01 * 10.0**-digits if digits else 0.0
+    return math.isclose(float(shown), float(printed), rel_tol=0.05, abs_tol=last)
 
 
 def missing(shown, printed):
@@ -97,17 +96,13 @@ def test_the_commands_of_a_page_run(page, tmp_path, command):
     pytest.importorskip('rclpy')
     given = blocks(page.read_text(encoding='utf-8'))
     mark = '=== block'
-    script = '\n'.join(
-        f'echo "{mark} {number}"\n{commands}' for number, (commands, _) in enumerate(given)
-    )
+    script = '\n'.join(f'echo "{mark} {k}"\n{words}' for k, (words, _) in enumerate(given))
+    places = command, Path(sys.executable).parent, os.environ['PATH']
     environment = {
-        **os.environ,
-        'PATH': os.pathsep.join(
-            map(str, [command, Path(sys.executable).parent, os.environ['PATH']])
-        ),
+        **os.environ, 'PATH': os.pathsep.join(map(str, places)),
         'PYTHONPATH': os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')]),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-    }
+    }  # fmt: skip
     for name in ('bags', 'examples'):
         (tmp_path / name).symlink_to(ROOT / name)
     output = tmp_path / 'output.log'
@@ -130,16 +125,11 @@ def test_the_commands_of_a_page_run(page, tmp_path, command):
         assert missing(shown, part) is None, f'not printed: {missing(shown, part)}\n{part}'
 
 
-def test_a_line_that_was_not_printed_is_found():
+def test_all_tutorials_are_run_and_a_line_that_was_not_printed_is_found():
+    assert {path.stem for path in TUTORIALS} >= set(SYSTEMS)
     printed = 'used 198\n  error 1.142 m\ndone 3\n'
     assert missing('used 198\n...\ndone 3\n', printed) is None
     assert missing('error 1.15 m\n', printed) is None
     assert missing('error 1.3 m\n', printed) == 'error 1.3 m'
     assert missing('done 3\nused 198\n', printed) == 'used 198'
     assert missing('used 198 times\n', printed) == 'used 198 times'
-
-
-def test_all_tutorials_are_run():
-    from sonar_imm.trackers import SYSTEMS
-
-    assert {path.stem for path in PAGES if path.parent.name == 'tutorials'} >= set(SYSTEMS)

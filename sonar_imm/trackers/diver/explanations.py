@@ -13,7 +13,7 @@ A hypothesis is a Gaussian: one model of one row. All functions take a flat list
 
 *Expected measurements*: likelihood, residuals and their covariance under the mixture.
 
-*All subsets* (`subset_ping`): the mathematics of `oracles.subset_update` of the tests, for
+*All subsets* (`subset_ping`): the mathematics of `oracles.robust` of the tests, for
 measurements that exclude or follow each other. Measurements of one *node*, the echoes of a
 transmitter-receiver pair, exclude each other: an explanation takes one of them as good, or none,
 which costs ``eps u`` for each. A measurement with a *parent*, the bearing that came with an echo,

@@ -8,7 +8,7 @@
 
 """A ping of many arrivals and the hypotheses about one diver: residuals with heavy tails.
 
-The mathematics of `oracles.student_t` of the tests, for a list of L hypotheses as in
+The mathematics of `oracles.robust` of the tests, for a list of L hypotheses as in
 `explanations`. Every hypothesis starts from its own prediction and from the positions that the
 ping suggests by itself, so that many good arrivals outvote any prior and no prior gates a ping
 away. The searches of all hypotheses are one list; those that have arrived drop out of it.

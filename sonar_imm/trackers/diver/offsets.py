@@ -121,19 +121,24 @@ class RecentPairs(NamedTuple):
     def assumed_covariance(self, place: FloatArray, known: int, sound_speed: float) -> FloatArray:
         """Return the covariance (known, known), m^2, of a position (3,) due to `ASSUMED` errors;
         its first `known` coordinates are states."""
-        tag = bool(np.isnan(self.tx[0, 0]))
-        paths = arrival_paths(place, None if tag else self.tx, self.rx)
+        # A track may be heard both by its tag and by its echoes of a transmitter.
+        tag = np.isnan(self.tx[:, 0])
+        one_way = arrival_paths(place, None, self.rx)
+        echo = arrival_paths(place, self.tx, self.rx)
+        by_position = np.where(tag[:, None], one_way.by_position, echo.by_position)
+        by_sound_speed = np.where(tag, one_way.by_sound_speed, echo.by_sound_speed)
         std = np.sqrt(self.variance)
-        H = np.column_stack([paths.by_position[:, :known], np.ones((len(std), int(tag)))])
+        emission = tag[:, None].astype(np.float64)[:, : int(tag.any())]
+        H = np.column_stack([by_position[:, :known], emission])
         gain = np.linalg.pinv(H / std[:, None], rcond=WEAK)[:known] / std
         off, late, slow = ASSUMED.values()
         far = np.hypot(*(self.rx - self.tx)[:, :2].T)
         receivers = np.array([pair[1] for pair in self.pairs])
-        D = [slow / sound_speed * paths.by_sound_speed]
+        D = [slow / sound_speed * by_sound_speed]
         for receiver in np.unique(receivers):
             own = receivers == receiver
             D.append(np.where(own, late * sound_speed, 0.0))
-            D += list(np.where(own & ~(far <= AT_TRANSMITTER), off * paths.by_offset.T, 0.0))
+            D += list(np.where(own & ~(far <= AT_TRANSMITTER), off * one_way.by_offset.T, 0.0))
         moved = gain @ np.stack(D, axis=1)
         return np.asarray(moved @ moved.T)
 

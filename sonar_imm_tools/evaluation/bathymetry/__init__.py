@@ -13,8 +13,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any, TYPE_CHECKING
+from collections.abc import Mapping
+from typing import Any
 
 from attrs import evolve
 import numpy as np
@@ -22,13 +22,10 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 from sonar_imm.soundings import SIDES
 
-from ...offline.run_folder import read_truth, RunFolder
-from ..judging import JudgeOptions, Limit, naming, Scored
+from ...offline.run_folder import read_truth
+from ..judging import Case, Limit
 from ..numbers import error, fill, look_up, Metric, NO_TRUTH
 from .scoring import profiles_of, score
-
-if TYPE_CHECKING:
-    from ..report import Section
 
 __all__ = ['LIMIT', 'METRICS', 'REMARK', 'scored', 'SEEN', 'summary_sentence']
 
@@ -37,24 +34,15 @@ LIMIT = Limit(0.25, 'm', 'height RMSE', 'height.all.rmse_m')
 paper the default reaches 0.15 m, and MUSIC, which has no terrain model, 0.27 m."""
 
 
-def scored(folder: RunFolder, run: Mapping[str, Any], options: JudgeOptions) -> Scored:
-    """Score the floors of `folder`. Raises `BagError` when they or the truth cannot be read."""
+def scored(case: Case) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    """Score the floors of a run, of each side against its own truth."""
     truth: list[Estimate] = []
-    for topic, side in truth_topics(run).items():
-        for table in read_truth(run, options.truth_bag, topic) or []:
+    for topic, side in truth_topics(case.run).items():
+        for table in read_truth(case.run, case.options.truth_bag, topic) or []:
             sided = {} if side is None else {'side': np.full(len(table), side, np.uint8)}
             truth.append(evolve(table, extras={**table.extras, **sided}))
-    with naming(folder.path):
-        swath = profiles_of(folder.read_estimates(), truth)
-    metrics = score(swath)
-
-    def sections() -> Iterable[Section]:
-        # plotly, which only a report needs, takes a second to load.
-        from .figures import sections
-
-        return sections(run, folder.path, swath)
-
-    return metrics, sections
+    swath = case.estimates(lambda estimates: profiles_of(estimates, truth))
+    return score(swath), (case.run, case.folder.path, swath)
 
 
 def truth_topics(run: Mapping[str, Any]) -> dict[str, int | None]:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 
 from sonar_imm.acoustics import array, spatial
 from sonar_imm.estimation.arrays import FloatArray
@@ -30,18 +29,7 @@ from ...offline.run_folder import read_measurements, RunFolder
 from ...recordings.export.points import Points, read_points
 from ...survey.chart import Chart, chart_of
 from ...survey.line import budget_of, without_far
-from ..plotting import (
-    add_band,
-    add_image,
-    add_line,
-    add_points,
-    AMBER,
-    BARE,
-    COLOURS,
-    INK,
-    styled,
-    thin,
-)
+from ..plotting import AMBER, BARE, COLOURS, INK, Picture, thin
 from ..report import Section
 from .scoring import BAND, Profile, runs, Swath
 
@@ -73,14 +61,26 @@ def _of_pings(run: Mapping[str, Any], swath: Swath) -> Iterator[Section]:
     number = len(swath.profiles) // 2
     profile = swath.profiles[number]
     which = f' Ping {number + 1} of {len(swath.profiles)}.'
+    true = '' if profile.truth is None else ' Dotted: truth. Blue: the true rough patch.'
+    two = ' Where bins have two surfaces, the estimate is the lower; the upper has its own line.'
+    if profile.two is None or not profile.two.any():
+        two = ''
+    elif profile.upper is None:
+        two = ' Bins with two surfaces are marked: the estimate there is neither.'
     yield Section(
         'Profile of the floor',
         'Height along one ping. Shaded: two standard deviations, which should hold 95 % of the '
-        f'truth.{_of_truth(profile)}{_of_two(profile)}{which}',
+        f'truth.{true}{two}{which}',
         profile_figure(profile),
         picture=True,
     )
-    if (snapshot := _snapshot(run, profile)) is not None:
+    snapshot = None  # when the recording is gone
+    for ping in read_measurements(run):
+        if isinstance(ping, Snapshot) and ping.stamp_ns == profile.stamp_ns:
+            if len(ping) == len(profile.range) and profile.side in ('', ping.side):
+                snapshot = ping
+                break
+    if snapshot is not None:
         spacing = spacing_of(snapshot, BathymetryConfig.from_mapping(run['parameters']))
         yield Section(
             'Pseudo-spectrum and estimated angle',
@@ -109,48 +109,25 @@ def _of_pings(run: Mapping[str, Any], swath: Swath) -> Iterator[Section]:
         )
 
 
-def _of_truth(profile: Profile) -> str:
-    return '' if profile.truth is None else ' Dotted: truth. Blue: the true rough patch.'
-
-
-def _of_two(profile: Profile) -> str:
-    """What the profile shows where bins have two surfaces."""
-    if profile.two is None or not profile.two.any():
-        return ''
-    if profile.upper is None:
-        return ' Bins with two surfaces are marked: the estimate there is neither.'
-    return ' Where bins have two surfaces, the estimate is the lower; the upper has its own line.'
-
-
-def _snapshot(run: Mapping[str, Any], profile: Profile) -> Snapshot | None:
-    """The samples of one ping, None when the recording is gone."""
-    for ping in read_measurements(run):
-        if not isinstance(ping, Snapshot) or ping.stamp_ns != profile.stamp_ns:
-            continue
-        if len(ping) == len(profile.range) and profile.side in ('', ping.side):
-            return ping
-    return None
-
-
-def profile_figure(profile: Profile) -> go.Figure:
+def profile_figure(profile: Profile) -> Picture:
     """Height of the floor along one ping with its two-sigma band, the truth and the true patch."""
-    figure = go.Figure()
+    figure = Picture()
     shown = thin(len(profile.range), MOST_BINS)
     ranges, height, std = profile.range[shown], profile.height[shown], profile.height_std[shown]
     known = np.isfinite(std)
     high, low = (height + BAND * std)[known], (height - BAND * std)[known]
     name = 'two standard deviations'
-    add_band(figure, ranges[known], high, low, AMBER, (0.3, 0.6), name=name)
+    figure.band(ranges[known], high, low, AMBER, (0.3, 0.6), name=name)
     _shade_patches(figure, profile)
     if profile.truth is not None:
         true = np.where(profile.truth.echo, profile.truth.height, np.nan)[shown]
         dotted = {'color': INK, 'width': 1.0, 'dash': 'dot'}
-        add_line(figure, ranges, true, 'truth', INK, line=dotted)
+        figure.line(ranges, true, 'truth', INK, line=dotted)
         if profile.truth.height_2 is not None:
             second = np.isfinite(profile.truth.height_2)
             place, height_2 = profile.range[second], profile.truth.height_2[second]
-            add_points(figure, place, height_2, 'truth, second surface', INK, size=2)
-    add_line(figure, ranges, height, 'estimate', COLOURS[0], 1.4)
+            figure.points(place, height_2, 'truth, second surface', INK, size=2)
+    figure.line(ranges, height, 'estimate', COLOURS[0], 1.4)
     marks = [('no echo', ~profile.echoes, 3)]
     if profile.upper is not None:
         _add_upper(figure, profile)
@@ -163,9 +140,9 @@ def profile_figure(profile: Profile) -> go.Figure:
         place = place[thin(len(place), MOST_BINS)]
         bottom = np.full(len(place), float(np.nanmin(profile.height)) - 0.3)
         if len(place):
-            add_points(figure, place, bottom, name, COLOURS[colour], symbol='line-ns-open')
+            figure.points(place, bottom, name, COLOURS[colour], symbol='line-ns-open')
     y = {'title': 'height above the reference [m]'}
-    return styled(figure, 400, SLANT | {'zeroline': False}, y)
+    return figure.styled(400, SLANT | {'zeroline': False}, y)
 
 
 def _patches(profile: Profile) -> list[tuple[float, float]]:
@@ -174,30 +151,23 @@ def _patches(profile: Profile) -> list[tuple[float, float]]:
     return [(profile.range[begin], profile.range[end - 1]) for begin, end in found]
 
 
-def _shade_patches(figure: go.Figure, profile: Profile) -> None:
+def _shade_patches(figure: Picture, profile: Profile) -> None:
     for begin, end in _patches(profile):
         figure.add_vrect(x0=begin, x1=end, fillcolor=COLOURS[5], opacity=0.12, line_width=0)
 
 
-def _add_upper(figure: go.Figure, profile: Profile) -> None:
-    """The upper one of two surfaces with its band."""
+def _add_upper(figure: Picture, profile: Profile) -> None:
     assert profile.upper is not None and profile.two is not None
-    height, std = profile.upper
     for number, (begin, end) in enumerate(runs(profile.two)):
-        part, first = slice(begin, end), number == 0
-        where, high = profile.range[part], height[part] + BAND * std[part]
-        low = height[part] - BAND * std[part]
-        add_band(figure, where, high, low, COLOURS[2], (0.15, 0.3), showlegend=False)
-        line = {'color': COLOURS[2], 'width': 1.4}
-        shown = {'legendgroup': 'upper', 'showlegend': first}
-        figure.add_scatter(
-            x=where, y=height[part], mode='lines', name='upper surface', line=line, **shown
-        )
+        where = profile.range[begin:end]
+        height, std = (part[begin:end] for part in profile.upper)
+        high, low, colour = height + BAND * std, height - BAND * std, COLOURS[2]
+        figure.band(where, high, low, colour, (0.15, 0.3), showlegend=False)
+        shown: dict[str, Any] = {'legendgroup': 'upper', 'showlegend': number == 0}
+        figure.line(where, height, 'upper surface', colour, 1.4, **shown)
 
 
-def spectrum_figure(
-    profile: Profile, snapshot: Snapshot, spacing: float, method: str = 'capon'
-) -> go.Figure:
+def spectrum_figure(profile: Profile, snapshot: Snapshot, spacing: float) -> Picture:
     """Angular pseudo-spectrum of one ping, with the estimated and the true angle.
 
     spacing: distance between staves in wavelengths, negative for a conjugated array.
@@ -206,13 +176,12 @@ def spectrum_figure(
     sines = np.linspace(-largest, largest, DIRECTIONS)
     bins = thin(len(snapshot), MOST_BINS)
     power = spatial.ping_spectrum(
-        snapshot.iq[bins], sines, abs(spacing), method=method, conjugate=spacing < 0.0
+        snapshot.iq[bins], sines, abs(spacing), method='capon', conjugate=spacing < 0.0
     )
     decibels = 10.0 * np.log10(power / power.max(axis=1, keepdims=True))
     angles = np.degrees(np.arcsin(sines))
-    figure = go.Figure()
-    add_image(
-        figure,
+    figure = Picture()
+    figure.image(
         np.round(profile.range[bins], 3),
         np.round(angles, 2),
         np.maximum(np.round(decibels), FLOOR_DB).T.astype(np.int8),
@@ -223,28 +192,22 @@ def spectrum_figure(
     )
     if profile.truth is not None:
         true = np.degrees(np.where(profile.truth.echo, profile.truth.angle, np.nan))
-        add_line(figure, profile.range[bins], true[bins], 'truth', AMBER, 1.2)
+        figure.line(profile.range[bins], true[bins], 'truth', AMBER, 1.2)
     estimated = np.degrees(profile.angle)
-    add_line(figure, profile.range[bins], estimated[bins], 'estimate', COLOURS[1], 1.6)
-    y = {'title': 'angle from broadside [°]', 'range': _view(estimated, angles)}
-    return styled(figure, 420, SLANT | BARE, y | BARE)
+    figure.line(profile.range[bins], estimated[bins], 'estimate', COLOURS[1], 1.6)
+    # The estimates with a margin, inside the view of the array.
+    view, known = [float(angles[0]), float(angles[-1])], estimated[np.isfinite(estimated)]
+    if len(known):
+        view = [max(float(known.min()) - 12.0, view[0]), min(float(known.max()) + 12.0, view[1])]
+    y = {'title': 'angle from broadside [°]', 'range': view}
+    return figure.styled(420, SLANT | BARE, y | BARE)
 
 
-def _view(shown: FloatArray, angles: FloatArray) -> list[float]:
-    """Range of the angle axis: the estimates with a margin, inside the view of the array."""
-    known = shown[np.isfinite(shown)]
-    if not len(known):
-        return [float(angles[0]), float(angles[-1])]
-    low, high = float(known.min()) - 12.0, float(known.max()) + 12.0
-    return [max(low, float(angles[0])), min(high, float(angles[-1]))]
-
-
-def models_figure(profile: Profile, names: Sequence[str]) -> go.Figure:
+def models_figure(profile: Profile, names: Sequence[str]) -> Picture:
     """Probability of each terrain model along one ping, as a heat strip."""
     bins = thin(len(profile.range), MOST_BINS)
-    figure = go.Figure()
-    add_image(
-        figure,
+    figure = Picture()
+    figure.image(
         np.round(profile.range[bins], 3),
         list(names),
         np.round(profile.probabilities[bins].T, 3),
@@ -252,10 +215,10 @@ def models_figure(profile: Profile, names: Sequence[str]) -> go.Figure:
     )
     for place in chain(*_patches(profile)):
         figure.add_vline(x=place, line={'color': COLOURS[1]})
-    return styled(figure, 180 + 24 * len(names), SLANT | BARE, BARE)
+    return figure.styled(180 + 24 * len(names), SLANT | BARE, BARE)
 
 
-def segmentation_figure(swath: Swath) -> go.Figure:
+def segmentation_figure(swath: Swath) -> Picture:
     """Probability of rough floor over pings and range, with the ends of the true patches."""
     first = swath.profiles[0]
     same_side = [profile for profile in swath.profiles if profile.side == first.side]
@@ -269,41 +232,33 @@ def segmentation_figure(swath: Swath) -> go.Figure:
             for profile in profiles
         ]
     )
-    figure = go.Figure()
-    add_image(
-        figure,
+    figure = Picture()
+    figure.image(
         np.round(ranges, 3),
         seconds,
         np.round(rough, 2),
         'probability of rough',
         hovertemplate='%{x:.2f} m, %{y:.2f} s: %{z:.2f}<extra></extra>',
     )
-    ends = [
-        (place, when)
-        for profile, when in zip(profiles, seconds)
-        for place in chain(*_patches(profile))
-    ]
+    ends = [(x, y) for each, y in zip(profiles, seconds) for x in chain(*_patches(each))]
     if ends:
-        x, y = np.array(ends).T
-        name = 'ends of the true patch'
-        add_points(figure, x, y, name, COLOURS[1], 6, symbol='line-ns-open')
-    return styled(figure, 340, SLANT | BARE, {'title': 'time [s]', 'autorange': 'reversed'} | BARE)
+        (x, y), name = np.array(ends).T, 'ends of the true patch'
+        figure.points(x, y, name, COLOURS[1], 6, symbol='line-ns-open')
+    return figure.styled(340, SLANT | BARE, {'title': 'time [s]', 'autorange': 'reversed'} | BARE)
 
 
-def verdict_figure(profile: Profile, rough: FloatArray) -> go.Figure:
+def verdict_figure(profile: Profile, rough: FloatArray) -> Picture:
     """Probability (n,) of rough floor along one ping, and the bins that cannot be told."""
-    figure = go.Figure()
+    figure = Picture()
     shown = thin(len(profile.range), MOST_BINS)
     _shade_patches(figure, profile)
-    add_line(figure, profile.range[shown], rough[shown], 'rough', COLOURS[0], 1.4)
+    figure.line(profile.range[shown], rough[shown], 'rough', COLOURS[0], 1.4)
     assert profile.verdict is not None
     place = profile.range[shown][profile.verdict[shown] == 2]
     if len(place):
         bottom = np.full(len(place), -0.05)
-        add_points(figure, place, bottom, 'cannot tell', COLOURS[3], symbol='line-ns-open')
-    return styled(
-        figure, 300, SLANT | {'zeroline': False}, {'title': 'probability of rough floor'}
-    )
+        figure.points(place, bottom, 'cannot tell', COLOURS[3], symbol='line-ns-open')
+    return figure.styled(300, SLANT | {'zeroline': False}, {'title': 'probability of rough floor'})
 
 
 def points_of(folder: Path) -> Points | None:
@@ -327,25 +282,19 @@ def finest_chart(points: Points, run: Mapping[str, Any]) -> Chart:
     return chart_of(points, float(cell), *budget_of(run))
 
 
-def chart_figure(grid: Chart, track: FloatArray) -> go.Figure:
+def chart_figure(grid: Chart, track: FloatArray) -> Picture:
     """Height of the floor in the grid, north up, and the track of the ship."""
     x, y = grid.axes()
-    figure = go.Figure()
-    figure.add_heatmap(
-        x=x,
-        y=y,
-        z=-grid.bands['depth'].astype(np.float32),
-        customdata=np.dstack(
-            [grid.bands[name].astype(np.float32) for name in ('uncertainty', 'label', 'count')]
-        ),
-        colorscale='Viridis',
-        colorbar={'title': 'z [m]'},
-        hovertemplate=(
-            'east %{x:.1f} m, north %{y:.1f} m<br>z %{z:.2f} m, sd %{customdata[0]:.2f} m<br>'
-            'model %{customdata[1]}, %{customdata[2]} soundings<extra></extra>'
-        ),
+    figure, shown = Picture(), ('depth', 'uncertainty', 'label', 'count')
+    depth, *others = (grid.bands[name].astype(np.float32) for name in shown)
+    hover = (
+        'east %{x:.1f} m, north %{y:.1f} m<br>z %{z:.2f} m, sd %{customdata[0]:.2f} m<br>'
+        'model %{customdata[1]}, %{customdata[2]} soundings<extra></extra>'
     )
+    colours = {'colorscale': 'Viridis', 'colorbar': {'title': 'z [m]'}}
+    data = np.dstack(others)
+    figure.add_heatmap(x=x, y=y, z=-depth, customdata=data, hovertemplate=hover, **colours)
     if len(track):
-        add_line(figure, track[:, 0], track[:, 1], 'track of the ship', INK, 1.5)
+        figure.line(track[:, 0], track[:, 1], 'track of the ship', INK, 1.5)
     east = {'title': 'east [m]', 'zeroline': False, 'constrain': 'domain'}
-    return styled(figure, 520, east, {'title': 'north [m]', 'zeroline': False, 'scaleanchor': 'x'})
+    return figure.styled(520, east, {'title': 'north [m]', 'zeroline': False, 'scaleanchor': 'x'})

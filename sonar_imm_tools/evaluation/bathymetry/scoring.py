@@ -119,12 +119,10 @@ def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None)
     profiles: list[Profile] = []
     names: tuple[str, ...] = ()
     for estimate in estimates:
-        names = estimate.model_names
+        names, stamp = estimate.model_names, estimate.stamp_ns
         # A single side that is no namespace: its truth names no side.
-        single = known.get((estimate.stamp_ns, 0))
-        profiles.append(
-            profile_of(estimate, known.get((estimate.stamp_ns, estimate.source), single))
-        )
+        true = known.get((stamp, estimate.source), known.get((stamp, 0)))
+        profiles.append(profile_of(estimate, true))
     return Swath(tuple(profiles), names, rough_models(names))
 
 
@@ -144,9 +142,8 @@ def rough_models(names: tuple[str, ...]) -> BoolArray:
 def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
     """One ping; the state is a height or an angle, and the other one follows from it. With
     navigation the stated error is that of the soundings: pose and sound speed are in it."""
-    bins = read_columns(
-        estimate, _BINS, "the estimates are not those of a floor: there is no column '{}'"
-    )
+    missing = "the estimates are not those of a floor: there is no column '{}'"
+    bins = read_columns(estimate, _BINS, missing)
     std = np.sqrt(estimate.covariance[:, 0, 0])
     # A small angle moves the point along the circle around the sonar: dh = |y| d(angle).
     arm = np.abs(estimate.xyz[:, 1].astype(np.float64))
@@ -223,13 +220,14 @@ def score(swath: Swath) -> dict[str, Any]:
     """All metrics of a run as plain numbers; without truth only those that need none."""
     profiles = swath.profiles
     stamps = [profile.stamp_ns for profile in profiles]
+    std = _finite([profile.height_std for profile in profiles])
     metrics: dict[str, Any] = {
         'pings': len(profiles),
         'span_s': (max(stamps) - min(stamps)) / SECOND if stamps else 0.0,
         'bins': sum(len(profile.range) for profile in profiles),
         'heard_share': _mean([profile.echoes for profile in profiles]),
         'rough_share': _mean([swath.roughness(profile) > 0.5 for profile in profiles]),
-        'height_std_median_m': _median([profile.height_std for profile in profiles]),
+        'height_std_median_m': float(np.median(std)) if len(std) else float('nan'),
     }
     looked = [profile.two for profile in profiles if profile.two is not None]
     if looked:
@@ -237,7 +235,13 @@ def score(swath: Swath) -> dict[str, Any]:
     metrics |= _verdicts(profiles)
     known = [(profile, profile.truth) for profile in profiles if profile.truth is not None]
     if known:
-        metrics |= {'scored_pings': len(known), **_errors(known), 'gate': _gate(known)}
+        shadow = [profile.echoes[_PLACES['shadow'](truth)] for profile, truth in known]
+        metrics |= {'scored_pings': len(known), **_errors(known)}
+        metrics['gate'] = {
+            'shadow_bins': sum(map(len, shadow)),
+            'shadow_passed_over': 1.0 - _mean(shadow),
+            'echo_heard': _mean([profile.echoes[truth.echo] for profile, truth in known]),
+        }
         metrics |= _layover(known)
         if swath.rough.any():
             metrics['segmentation'] = segmentation(swath, known)
@@ -246,9 +250,7 @@ def score(swath: Swath) -> dict[str, Any]:
 
 def _errors(known: Known) -> dict[str, Any]:
     """Errors of height and angle, and the share inside the band, by place."""
-    height: dict[str, Any] = {}
-    angle: dict[str, Any] = {}
-    inside: dict[str, float] = {}
+    scores: dict[str, Any] = {'height': {}, 'angle': {}, 'inside_band': {}}
     for place, choose in _PLACES.items():
         high, turn, held = [], [], []
         for profile, truth in known:
@@ -257,10 +259,10 @@ def _errors(known: Known) -> dict[str, Any]:
             high.append(error)
             turn.append(np.degrees(np.abs(profile.angle - truth.angle)[bins]))
             held.append(error <= BAND * profile.height_std[bins])
-        height[place] = error_summary(_finite(high))
-        angle[place] = error_summary(_finite(turn), unit='deg')
-        inside[place] = _mean(held)
-    return {'height': height, 'angle': angle, 'inside_band': inside}
+        scores['height'][place] = error_summary(_finite(high))
+        scores['angle'][place] = error_summary(_finite(turn), unit='deg')
+        scores['inside_band'][place] = _mean(held)
+    return scores
 
 
 def height_error(profile: Profile, truth: TrueFloor) -> FloatArray:
@@ -269,17 +271,6 @@ def height_error(profile: Profile, truth: TrueFloor) -> FloatArray:
     if profile.upper is None or profile.two is None:
         return error
     return np.where(profile.two, truth.to_nearest(profile.height), error)
-
-
-def _gate(known: Known) -> dict[str, Any]:
-    """How well the gate tells shadow from echo."""
-    shadow = [profile.echoes[_PLACES['shadow'](truth)] for profile, truth in known]
-    echo = [profile.echoes[truth.echo] for profile, truth in known]
-    return {
-        'shadow_bins': sum(map(len, shadow)),
-        'shadow_passed_over': 1.0 - _mean(shadow),
-        'echo_heard': _mean(echo),
-    }
 
 
 def _layover(known: Known) -> dict[str, Any]:
@@ -371,8 +362,3 @@ def _finite(parts: list[FloatArray]) -> FloatArray:
 def _mean(parts: list[BoolArray]) -> float:
     values = np.concatenate(parts) if parts else np.empty(0)
     return float(values.mean()) if len(values) else float('nan')
-
-
-def _median(parts: list[FloatArray]) -> float:
-    values = _finite(parts)
-    return float(np.median(values)) if len(values) else float('nan')

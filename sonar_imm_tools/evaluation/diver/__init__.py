@@ -18,16 +18,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from itertools import chain
-from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
-from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.georeferencing import Georeferencer
 
-from ...offline.run_folder import read_measurements, read_truth, RunFolder
-from ..judging import JudgeOptions, Limit, naming, Scored
+from ..judging import Case, Limit
 from ..numbers import (
     chi2,
     counted,
@@ -44,9 +42,6 @@ from ..numbers import (
 from .scoring import fix_series, score
 from .series import series_of, Truth
 
-if TYPE_CHECKING:
-    from ..report import Section
-
 __all__ = ['LIMIT', 'METRICS', 'REMARK', 'scored', 'SEEN', 'summary_sentence']
 
 LIMIT = Limit(1.25, 'm', 'position RMSE', 'position.rmse_m')
@@ -54,39 +49,29 @@ LIMIT = Limit(1.25, 'm', 'position RMSE', 'position.rmse_m')
 tracker 0.85 m on average; one recording can be worse than the average."""
 
 
-def scored(folder: RunFolder, run: Mapping[str, Any], options: JudgeOptions) -> Scored:
-    """Score the tracks of `folder`. Raises `BagError` when they or the truth cannot be read."""
-    with naming(folder.path):
-        series = series_of(folder.read_estimates())
-    truth = _truth(run, options)
-    config = DiverConfig.from_mapping(run['parameters'], ignore_unknown=True)
+def scored(case: Case) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    """Score the tracks of a run against true paths, and the raw fixes too."""
+
+    def true_paths(rows: Iterable[Estimate]) -> Truth:
+        truth = Truth.from_series(series_of(rows), max_gap=case.options.gap)
+        return truth.shifted(case.options.lag)
+
+    series = case.estimates(series_of)
+    truth = case.truth(true_paths)
+    config = case.config(DiverConfig)
     georeferencer = Georeferencer(config, Counter())
-    placed = chain.from_iterable(map(georeferencer.georeference, read_measurements(run)))
+    placed = chain.from_iterable(map(georeferencer.georeference, case.measurements()))
     fixes = [item for item in placed if isinstance(item, (Fix, Fixes))]
     raw = fix_series(fixes) if fixes else None
-    metrics = score(series, truth, fixes=raw, cutoff=options.cutoff)
-    metrics['truth_lag_s'] = options.lag
-
-    def sections() -> Iterable[Section]:
-        # plotly, which only a report needs, takes a second to load.
-        from .figures import sections
-
-        # Of a run whose first fix was the origin, only the run knows it.
-        origin = Origin(**run['origin']) if run.get('origin') else config.stated_origin()
-        return sections(metrics, series, truth, raw, origin, run.get('target_names'))
-
-    return metrics, sections
+    metrics = score(series, truth, fixes=raw, cutoff=case.options.cutoff)
+    metrics['truth_lag_s'] = case.options.lag
+    # Of a run whose first fix was the origin, only the run knows it.
+    origin = case.origin() or config.stated_origin()
+    return metrics, (metrics, series, truth, raw, origin, case.run.get('target_names'))
 
 
-def _truth(run: Mapping[str, Any], options: JudgeOptions) -> Truth | None:
-    rows = read_truth(run, options.truth_bag)
-    if rows is None:
-        return None
-    with naming(options.truth_bag or Path(run['bag'])):
-        return Truth.from_series(series_of(rows), max_gap=options.gap).shifted(options.lag)
-
-
-def _remark(metrics: Mapping[str, Any]) -> str:
+def remark(metrics: Mapping[str, Any]) -> str:
+    """What follows the error: that of the raw fixes, and how much was found."""
     raw = metrics.get('raw_fix', {}).get('rmse_m')
     remarks = [f'raw fixes {raw:.2f} m'] if raw else []
     if metrics['beyond_cutoff']['n']:
@@ -159,7 +144,7 @@ def seen(metrics: Mapping[str, Any]) -> str:
     return fill(f'{found}, {{stamps}} stamps in {{span_s:.0f}} s', metrics)
 
 
-SEEN, REMARK = seen, _remark
+SEEN, REMARK = seen, remark
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
@@ -190,7 +175,6 @@ def summary_sentence(metrics: Mapping[str, Any]) -> str:
 
 
 def _against_fixes(metrics: Mapping[str, Any]) -> str:
-    """Compare the track with the fixes at the same stamps."""
     same, beyond = metrics['same_stamps'], metrics['raw_fix']['beyond']
     raw = same['raw_rmse_m']
     if not same['n']:

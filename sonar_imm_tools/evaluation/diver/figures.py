@@ -15,26 +15,22 @@ from html import escape
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from sonar_imm.acoustics.geodesy import Origin
-from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.estimation.arrays import FloatArray
 
 from ..plotting import (
-    add_band,
-    add_image,
-    add_line,
-    add_points,
     AMBER,
     BARE,
     COLOURS,
     GREY,
     in_degrees,
+    INK,
     MOST_POINTS,
     nis_figure,
+    Picture,
     seconds,
-    styled,
     thin,
     TIME,
     transparent,
@@ -83,9 +79,8 @@ def sections(
             error_figure(matching, track_id),
         )
     else:
-        yield Section(
-            'Stated uncertainty', f'One sigma on each axis.{which}', sigma_figure(series, track_id)
-        )
+        text = f'One sigma on each axis.{which}'
+        yield Section('Stated uncertainty', text, sigma_figure(series, track_id))
     if series.model_names:
         yield Section(
             'Which motion model held',
@@ -121,12 +116,12 @@ def map_figure(
     truth: Truth | None,
     fixes: Series | None,
     names: Mapping[str, str] | None = None,
-) -> go.Figure:
+) -> Picture:
     """Truth, fixes and tracks from above with equal axes; 95 % ellipses along each track.
 
     names: of targets by target ID.
     """
-    figure = go.Figure()
+    figure = Picture()
     if fixes is not None and len(fixes):
         shown = thin(len(fixes), MOST_POINTS)
         figure.add_scattergl(
@@ -139,59 +134,39 @@ def map_figure(
         )
     paths = truth.paths if truth else ()
     for path in paths:
-        shown = thin(len(path.stamp_ns), MOST_POINTS)
-        figure.add_scatter(
-            x=path.state[shown, 0],
-            y=path.state[shown, 1],
-            mode='lines',
-            name='truth',
-            legendgroup='truth',
-            showlegend=path is paths[0],
-            hovertemplate=f'target {path.track_id}: x %{{x:.2f}}, y %{{y:.2f}}',
-            line=TRUTH,
-        )
-    for order, track_id in enumerate(_tracks_by_length(series)):
+        x, y = path.state[thin(len(path.stamp_ns), MOST_POINTS), :2].T
+        legend: dict[str, Any] = {'legendgroup': 'truth', 'showlegend': path is paths[0]}
+        hover = f'target {path.track_id}: x %{{x:.2f}}, y %{{y:.2f}}'
+        figure.line(x, y, 'truth', INK, line=TRUTH, hovertemplate=hover, **legend)
+    ids, counts = np.unique(series.track_id, return_counts=True)
+    for order, track_id in enumerate(ids[np.argsort(-counts, kind='stable')]):
         track = series.pick(series.track_id == track_id)
         # Labels are HTML.
         _add_track(figure, track, order, escape(series.name(track_id, names or {})))
     # Clutter can lie anywhere: the first view shows tracks and truth, the rest by zooming out.
-    x_range, y_range = view_of(
-        np.concatenate([series.state[:, :2], *(path.state[:, :2] for path in paths)])
-    )
+    every = [series.state[:, :2], *(path.state[:, :2] for path in paths)]
+    x_range, y_range = view_of(np.concatenate(every))
     y = {'title': 'y [m]', 'range': y_range, 'scaleanchor': 'x', 'scaleratio': 1}
-    return styled(figure, 640, {'title': 'x [m]', 'range': x_range}, y)
+    return figure.styled(640, {'title': 'x [m]', 'range': x_range}, y)
 
 
-def _add_track(figure: go.Figure, track: Series, order: int, name: str) -> None:
+def _add_track(figure: Picture, track: Series, order: int, name: str) -> None:
     colour = COLOURS[order % len(COLOURS)]
-    shown = thin(len(track), MOST_POINTS)
-    outline = outlines(track.state[:, :2], track.covariance[:, :2, :2])
-    figure.add_scatter(
-        x=outline[:, 0],
-        y=outline[:, 1],
-        mode='lines',
-        fill='toself',
-        fillcolor=transparent(colour, 0.10),
-        hoverinfo='skip',
-        line={'color': transparent(colour, 0.35), 'width': 1},
-        legendgroup=name,
-        showlegend=False,
-    )
-    figure.add_scatter(
-        x=track.state[shown, 0],
-        y=track.state[shown, 1],
-        mode='lines+markers',
-        name=name,
-        legendgroup=name,
-        showlegend=order < MOST_TRACKS_NAMED,
-        line={'color': colour, 'width': 2},
-        marker={'size': 4},
-        customdata=seconds(track.stamp_ns[shown], track.scan_ns),
-        hovertemplate='%{customdata:.1f} s: x %{x:.2f}, y %{y:.2f}',
-    )
+    x, y = outlines(track.state[:, :2], track.covariance[:, :2, :2]).T
+    group: dict[str, Any] = {'legendgroup': name, 'showlegend': False}
+    fill = transparent(colour, 0.10)
+    area = group | {'fill': 'toself', 'fillcolor': fill, 'hoverinfo': 'skip'}
+    figure.line(x, y, None, transparent(colour, 0.35), 1, **area)
+    track = track.pick(thin(len(track), MOST_POINTS))
+    shown = group | {'showlegend': order < MOST_TRACKS_NAMED, 'mode': 'lines+markers'}
+    time = seconds(track.stamp_ns, track.scan_ns)
+    hover = '%{customdata:.1f} s: x %{x:.2f}, y %{y:.2f}'
+    shown |= {'marker': {'size': 4}, 'customdata': time, 'hovertemplate': hover}
+    x, y = track.state[:, :2].T
+    figure.line(x, y, name, colour, **shown)
 
 
-def error_figure(matching: Matching, track_id: int) -> go.Figure:
+def error_figure(matching: Matching, track_id: int) -> Picture:
     """Error in x and y of one track, over the 95 % band that the tracker predicted."""
     series = matching.series
     rows = series.track_id[matching.row] == track_id
@@ -199,35 +174,37 @@ def error_figure(matching: Matching, track_id: int) -> go.Figure:
     order = np.argsort(series.stamp_ns[row], kind='stable')
     row, error = row[order], matching.error[rows][order]
     time = seconds(series.stamp_ns[row], series.scan_ns)
-    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
+    figure = make_subplots(
+        figure=Picture(), rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06
+    )
     for axis, name in enumerate('xy'):
         place = {'row': axis + 1, 'col': 1}
         shared = {'showlegend': axis == 0, **place}
         half = 1.96 * np.sqrt(series.covariance[row, axis, axis])
         band = {'name': 'predicted 95 % band', 'legendgroup': 'band', **shared}
-        add_band(figure, time, half, -half, AMBER, (0.28, 0.6), **band)
+        figure.band(time, half, -half, AMBER, (0.28, 0.6), **band)
         line = {'mode': 'lines+markers', 'marker': {'size': 3}, 'legendgroup': 'error', **shared}
         name_of_all = 'error of the track'
-        add_line(figure, time, error[:, axis], name_of_all, COLOURS[0], 1.2, gl=True, **line)
+        figure.line(time, error[:, axis], name_of_all, COLOURS[0], 1.2, gl=True, **line)
         figure.update_yaxes(title=f'{name} error [m]', **place)
     figure.update_xaxes(title='time [s]', row=2, col=1)
-    return styled(figure, 460, {'zeroline': False}, {})
+    return figure.styled(460, {'zeroline': False}, {})
 
 
-def sigma_figure(series: Series, track_id: int) -> go.Figure:
+def sigma_figure(series: Series, track_id: int) -> Picture:
     """Stated standard deviations over time, for runs without truth."""
     track = series.pick(series.track_id == track_id)
     time = seconds(track.stamp_ns, track.scan_ns)
-    figure = go.Figure()
+    figure = Picture()
     for axis, name in enumerate('xy'):
         sigma = np.sqrt(track.covariance[:, axis, axis])
-        add_line(figure, time, sigma, name, COLOURS[axis], 1.5, gl=True)
-    return styled(figure, 320, TIME, {'title': 'stated sigma [m]', 'rangemode': 'tozero'})
+        figure.line(time, sigma, name, COLOURS[axis], 1.5, gl=True)
+    return figure.styled(320, TIME, {'title': 'stated sigma [m]', 'rangemode': 'tozero'})
 
 
 def models_figure(
     series: Series, track_id: int, truth_course: tuple[FloatArray, FloatArray] | None
-) -> go.Figure:
+) -> Picture:
     """Model probabilities of one track as a heat strip, headings in order, other models below;
     what several families have (`headings_together`) in one row.
 
@@ -239,9 +216,8 @@ def models_figure(
     order = np.array(model_order(names), int)
     headings = sum(name.startswith('heading_') for name in names)
     names = np.array(names)[order]
-    figure = go.Figure()
-    add_image(
-        figure,
+    figure = Picture()
+    figure.image(
         seconds(track.stamp_ns, track.scan_ns),
         np.arange(len(order)),
         probabilities[:, order].T,
@@ -251,21 +227,19 @@ def models_figure(
     if truth_course is not None and headings:
         time, degrees = truth_course
         row = len(order) - headings + np.mod(degrees, 360.0) * headings / 360.0
-        add_points(figure, time, row, 'true course', COLOURS[1])
+        figure.points(time, row, 'true course', COLOURS[1])
         figure.data[-1].showlegend = True
     rows = {'tickvals': np.arange(len(order)), 'range': [-0.5, len(order) - 0.5]}
     labels = [model_label(name) for name in names]
     height = 180 + 18 * len(order)
-    return styled(figure, height, TIME | BARE, {'ticktext': labels} | rows | BARE)
+    return figure.styled(height, TIME | BARE, {'ticktext': labels} | rows | BARE)
 
 
-def outlines(
-    mean: FloatArray, covariance: FloatArray, *, probability: float = 0.95, points: int = 40
-) -> FloatArray:
+def outlines(mean: FloatArray, covariance: FloatArray, *, probability: float = 0.95) -> FloatArray:
     """(m, 2) outlines of Gaussian ellipses that hold `probability`, NaN rows between them."""
     shown = thin(len(mean), MOST_ELLIPSES)
     values, vectors = np.linalg.eigh(covariance[shown])
-    angle = np.linspace(0.0, 2.0 * np.pi, points)
+    angle = np.linspace(0.0, 2.0 * np.pi, 40)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     radii = np.sqrt(-2.0 * np.log1p(-probability) * np.maximum(values, 0.0))
     shape = vectors @ (radii[:, :, None] * circle)
@@ -276,8 +250,7 @@ def outlines(
 def headings_together(
     names: tuple[str, ...], probabilities: FloatArray
 ) -> tuple[tuple[str, ...], FloatArray]:
-    """Models and their probabilities (n, M), those of the families `steady` and `brisk` with the
-    same heading added up."""
+    """Models and their probabilities (n, M), the same heading of `steady` and `brisk` added up."""
     short = [name.removeprefix('steady_').removeprefix('brisk_') for name in names]
     first = tuple(dict.fromkeys(short))
     added = np.array([[name == each for each in first] for name in short], float)
@@ -286,16 +259,9 @@ def headings_together(
 
 def model_order(names: tuple[str, ...]) -> list[int]:
     """Indices of `names`: other models first, that is at the bottom, then headings by angle."""
-    return sorted(
-        range(len(names)), key=lambda index: (names[index].startswith('heading_'), names[index])
-    )
+    return sorted(range(len(names)), key=lambda k: (names[k].startswith('heading_'), names[k]))
 
 
 def model_label(name: str) -> str:
     """Label of a model: ``heading_022`` gives ``22°``."""
     return f'{int(name[8:])}°' if name.startswith('heading_') and name[8:].isdigit() else name
-
-
-def _tracks_by_length(series: Series) -> IntArray:
-    ids, counts = np.unique(series.track_id, return_counts=True)
-    return ids[np.argsort(-counts, kind='stable')]

@@ -66,31 +66,27 @@ def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
             'tune takes fixes; what this recording holds are arrival times, whose likelihood the '
             'tracker does not keep'
         )
-    scale, least = config.covariance_scale, min(1.0, config.covariance_scale)
-    found = [Tunable(name='covariance_scale', start=scale, std=3.0, least=least, scanned=True)]
+    least = min(1.0, config.covariance_scale)
+    found = [Tunable.of(config, 'covariance_scale', std=3.0, least=least, scanned=True)]
     if config.model_set not in MODEL_SETS:
         # A set of another package may read these where they are configured; if not, the
         # likelihood does not depend on them.
-        noise = config.acceleration_noise
-        for place, value in enumerate(noise):
-            found.append(
-                Tunable(name='acceleration_noise', start=value, place=place, whole=tuple(noise))
-            )
+        whole = tuple(config.acceleration_noise)
+        found += [
+            Tunable(name='acceleration_noise', start=value, place=place, whole=whole)
+            for place, value in enumerate(whole)
+        ]
     else:
-        found.append(Tunable(name='stay_probability', start=config.stay_probability, kind='logit'))
-        found.append(_of(config, 'speed_mean', std=0.7))
-        found.append(_of(config, 'speed_std', std=0.7, usual=False))
-        found.append(_of(config, 'speed_noise', usual=False))
+        found.append(Tunable.of(config, 'stay_probability', kind='logit'))
+        found.append(Tunable.of(config, 'speed_mean', std=0.7))
+        found.append(Tunable.of(config, 'speed_std', std=0.7, usual=False))
+        found.append(Tunable.of(config, 'speed_noise', usual=False))
     scans = any(isinstance(item, Fixes) and len(item) != 1 for item in measurements)
-    found.append(_of(config, 'detection_probability', kind='logit', usual=scans))
+    found.append(Tunable.of(config, 'detection_probability', kind='logit', usual=scans))
     found.append(Tunable(name='clutter_density', start=config.usual_clutter, usual=scans))
-    found.append(_of(config, 'birth_density', usual=False))
+    found.append(Tunable.of(config, 'birth_density', usual=False))
     edge = (0.0, 1.0)
     return [t for t in found if t.start > 0.0 and not (t.kind == 'logit' and t.start in edge)]
-
-
-def _of(config: DiverConfig, name: str, **settings: Any) -> Tunable:
-    return Tunable(name=name, start=getattr(config, name), **settings)
 
 
 class Scored(DiverTracker):
@@ -106,11 +102,8 @@ class Scored(DiverTracker):
         super()._apply_config(config)
         # A track that begins anew at a fix is asked once more: that is no prediction of it.
         after = self._group_stages.index(self._associate) + 1
-        self._group_stages = (
-            *self._group_stages[:after],
-            self._scoring,
-            *self._group_stages[after:],
-        )
+        stages = self._group_stages
+        self._group_stages = (*stages[:after], self._scoring, *stages[after:])
 
     def _process_scan(self, before: Known, stamp_ns: int, items: Any) -> Known:
         self.scores[stamp_ns] = (0.0, 0)

@@ -246,10 +246,8 @@ def gospa_summary(matching: Matching, truth: Truth, cutoff: float) -> dict[str, 
     """GOSPA (p = 2, alpha = 2) averaged over the scored stamps, and its parts; and the same of the
     run as a whole with half of the cutoff for each identity switch."""
     series, states = matching.series, truth.at(matching.scan_ns)
-    starts = np.searchsorted(series.stamp_ns, matching.scan_ns, side='left')
-    ends = np.searchsorted(series.stamp_ns, matching.scan_ns, side='right')
     parts = []
-    for scan, (start, end) in enumerate(zip(starts, ends)):
+    for scan, (start, end) in enumerate(zip(*series.spans(matching.scan_ns))):
         there = states[matching.present[:, scan], scan, :2]
         parts.append(gospa(there, series.state[start:end, :2], cutoff))
     if not parts:

@@ -26,11 +26,10 @@ from collections.abc import Iterable, Mapping
 
 from attrs import evolve, frozen
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from sonar_imm.estimates import Estimate
-from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 from sonar_imm.estimation.consistency import identity_switches
 from sonar_imm.measurements import NOBODY
 
@@ -71,8 +70,7 @@ class Series(Rows):
         return self.pick(np.isfinite(self.nis) & (self.nis_dof > 0))
 
     def name(self, track_id: int, names: Mapping[str, str]) -> str:
-        """Return what a track is called: by the name of its target, if it has one. names: of
-        targets by target ID."""
+        """Return what a track is called, by its target where `names` (by target ID) has it."""
         own = self.target_id[self.track_id == track_id]
         found = [names[key] for key in map(str, own[::-1].tolist()) if key in names]
         return f'{found[0]} (track {track_id})' if found else f'track {track_id}'
@@ -94,9 +92,8 @@ def series_of(estimates: Iterable[Estimate]) -> Series:
     models = {estimate.model_names for estimate in estimates if len(estimate)}
     if len(models) > 1:
         raise ValueError('the models change within the recording: it holds more than one run')
-    series = read_rows(
-        Series, estimates, "the estimates have no column '{}'", model_names=next(iter(models), ())
-    )
+    missing, names = "the estimates have no column '{}'", next(iter(models), ())
+    series = read_rows(Series, estimates, missing, model_names=names)
     return evolve(series, scan_ns=np.unique(series.scan_ns))
 
 
@@ -153,8 +150,7 @@ class Truth:
         return len(self.paths)
 
     def shifted(self, lag: float) -> Truth:
-        """The truth shifted by `lag` seconds: estimates at t are compared with truth at t +
-        lag."""
+        """The truth `lag` seconds earlier: estimates at t are compared with truth at t + lag."""
         shift = round(lag * SECOND)
         paths = (evolve(path, stamp_ns=path.stamp_ns - shift) for path in self.paths)
         return evolve(self, paths=tuple(paths))
@@ -194,9 +190,9 @@ class Matching:
     beyond_row: IntArray
     beyond_truth: FloatArray
     scan_ns: IntArray
-    present: NDArray[np.bool_]
+    present: BoolArray
     followed_by: IntArray
-    scored: NDArray[np.bool_]
+    scored: BoolArray
 
     @property
     def error(self) -> FloatArray:
@@ -214,9 +210,9 @@ def match(series: Series, truth: Truth, *, cutoff: float) -> Matching:
     states = truth.at(series.scan_ns)
     present = np.isfinite(states[:, :, 0])
     known = present.any(axis=0)
-    limit = np.inf if _one_to_one(series, truth) else cutoff
-    starts = np.searchsorted(series.stamp_ns, series.scan_ns, side='left')
-    ends = np.searchsorted(series.stamp_ns, series.scan_ns, side='right')
+    one_to_one = len(truth) == 1 and len(np.unique(series.stamp_ns)) == len(series)
+    limit = np.inf if one_to_one else cutoff
+    starts, ends = series.spans(series.scan_ns)
     followed_by = np.full(present.shape, -1, np.int64)
     near: list[tuple[np.integer, ...]] = []
     beyond: list[tuple[np.integer, ...]] = []
@@ -262,10 +258,6 @@ def assign(distance: FloatArray, limit: float) -> list[tuple[int, int]]:
     ]
 
 
-def _one_to_one(series: Series, truth: Truth) -> bool:
-    return len(truth) == 1 and len(np.unique(series.stamp_ns)) == len(series)
-
-
 def track_summary(matching: Matching) -> dict[str, float]:
     """Counts that describe whole tracks.
 
@@ -275,26 +267,21 @@ def track_summary(matching: Matching) -> dict[str, float]:
     """
     series = matching.series
     found = matching.followed_by != -1
-    present = int(matching.present.sum())
+    wanted = int(matching.present.sum())
     scored_ids, lifetimes = np.unique(series.track_id[matching.scored], return_counts=True)
     on_target = series.track_id[matching.row]
     hits = np.array([np.count_nonzero(on_target == track_id) for track_id in scored_ids])
+    begins = [
+        np.diff(f[there].astype(np.int8), prepend=0) for f, there in zip(found, matching.present)
+    ]
     return {
         'true_targets': int(matching.present.any(axis=1).sum()),
         'tracks': len(scored_ids),
         'false_tracks': int(np.count_nonzero(2 * hits < lifetimes)),
         'identity_switches': identity_switches(matching.followed_by.T),
-        'fragmentations': sum(
-            _interruptions(is_found[there]) for is_found, there in zip(found, matching.present)
-        ),
-        'completeness': float(found.sum() / present) if present else float('nan'),
+        'fragmentations': sum(max(0, np.count_nonzero(each == 1) - 1) for each in begins),
+        'completeness': float(found.sum() / wanted) if wanted else float('nan'),
         'false_rows_per_scan': float(
             (matching.scored.sum() - len(matching.row)) / max(1, len(matching.scan_ns))
         ),
     }
-
-
-def _interruptions(found: NDArray[np.bool_]) -> int:
-    """How often a target that had been found was found again after a loss."""
-    begins = np.count_nonzero(np.diff(found.astype(np.int8), prepend=0) == 1)
-    return max(0, int(begins) - 1)

@@ -13,16 +13,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any, TYPE_CHECKING
+from collections.abc import Mapping
+from typing import Any
 
-from ...offline.run_folder import read_truth, RunFolder
-from ..judging import JudgeOptions, Limit, Scored
+from ...offline.run_folder import read_truth
+from ..judging import Case, Limit
 from ..numbers import error, fill, Metric, NO_TRUTH
 from .scoring import CUTOFF, records_of, score
-
-if TYPE_CHECKING:
-    from ..report import Section
 
 __all__ = ['LIMIT', 'METRICS', 'REMARK', 'scored', 'SEEN', 'summary_sentence']
 
@@ -31,24 +28,14 @@ LIMIT = Limit(0.08, 'm', 'OSPA', 'ospa_m')
 long drifts; one recording can be worse than the average."""
 
 
-def scored(folder: RunFolder, run: Mapping[str, Any], options: JudgeOptions) -> Scored:
-    """Score the reflectors of `folder`. Raises `BagError` when it or the truth cannot be read."""
-    records = records_of(
-        folder.read_estimates(),
-        read_truth(run, options.truth_bag),
-        lag=options.lag,
-        gap=options.gap,
-    )
+def scored(case: Case) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    """Score the reflectors of a run, record by record."""
+    options = case.options
+    truth = read_truth(case.run, options.truth_bag)
+    records = records_of(case.folder.read_estimates(), truth, lag=options.lag, gap=options.gap)
     metrics = score(records, CUTOFF if options.cutoff is None else options.cutoff)
     metrics['truth_lag_s'] = options.lag
-
-    def sections() -> Iterable[Section]:
-        # plotly, which only a report needs, takes a second to load.
-        from .figures import sections
-
-        return sections(run, metrics, records)
-
-    return metrics, sections
+    return metrics, (case.run, metrics, records)
 
 
 def _unscored(metrics: Mapping[str, Any]) -> bool:

@@ -33,20 +33,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from attrs import evolve
 import numpy as np
-import plotly.graph_objects as go
 
 from sonar_imm.acoustics.geodesy import EARTH_RADIUS
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 
-from ...offline.run_folder import read_measurements, RunFolder
+from ...offline.run_folder import RunFolder
 from ...recordings.positions import read_positions
 from ...recordings.reader import BagReader
 from ...recordings.sources import BagError
-from ..plotting import COLOURS, styled
+from ..plotting import COLOURS, Picture
+from .figures import responses
 
 AT, REACH, LEAST = 5.0, 25.0, 5
 
@@ -85,6 +84,10 @@ def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[st
     origin = float(lines[0].longitude[0]), float(lines[0].latitude[0])
     tracks = [_plane(line, origin) for line in lines]
     crossings = []
+
+    def between(values: FloatArray, row: int, share: float) -> float:
+        return float(values[row] + share * (values[row + 1] - values[row]))
+
     for i, j, s, t, directions in _meetings(*tracks):
         found = [
             _horizons(line, track, row + share, position_std)
@@ -96,8 +99,8 @@ def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[st
             {
                 'stamp_a_ns': lines[0].records[i].stamp_ns,
                 'stamp_b_ns': lines[1].records[j].stamp_ns,
-                'longitude': _between(lines[0].longitude, i, s),
-                'latitude': _between(lines[0].latitude, i, s),
+                'longitude': between(lines[0].longitude, i, s),
+                'latitude': between(lines[0].latitude, i, s),
                 'angle_deg': float(np.degrees(np.arctan2(abs(sine), abs(cosine)))),
                 **compared(found[0], found[1], limit, directions, position_std),
             }
@@ -116,10 +119,7 @@ def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[st
 def summary(judged: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Numbers of horizons that are judged. between_lines_m: standard deviation that, added to what
     is stated, makes their mean square 1 (Paule and Mandel); 0 where none is missing."""
-    sigmas = np.array([pair['sigmas'] for pair in judged])
-    difference, std = (
-        np.array([pair[key] for pair in judged]) for key in ('difference_m', 'std_m')
-    )
+    sigmas, difference, std = _columns(judged, 'sigmas', 'difference_m', 'std_m')
     return {
         'judged': len(judged),
         'rms_difference_m': _rms(difference),
@@ -180,38 +180,32 @@ def crossing_lines(metrics: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def mistie_figure(metrics: Mapping[str, Any]) -> go.Figure:
+def mistie_figure(metrics: Mapping[str, Any]) -> Picture:
     """The difference of each horizon that both lines have, from above, with two stated standard
     deviations; filled where it is judged. metrics: of `crossing_metrics`."""
-    figure = go.Figure()
+    figure = Picture()
     for number, crossing in enumerate(metrics['crossings'], start=1):
         for judged in (True, False):
             shown = [h for h in crossing['horizons'] if h['judged'] == judged]
             if not shown:
                 continue
-            kinds = [
-                'floor' if h['bottom'] else 'multiple' if h['multiple'] else '' for h in shown
-            ]
+            what = ['floor' if h['bottom'] else 'multiple' if h['multiple'] else '' for h in shown]
             depths = [0.5 * (h['depth_a_m'] + h['depth_b_m']) for h in shown]
             colour = COLOURS[(number - 1) % len(COLOURS)]
+            symbol = 'circle' if judged else 'circle-open'
             figure.add_scatter(
                 x=[h['difference_m'] for h in shown],
-                y=[f'{kind} {depth:.1f} m ({number})' for kind, depth in zip(kinds, depths)],
+                y=[f'{kind} {depth:.1f} m ({number})' for kind, depth in zip(what, depths)],
                 error_x={'array': [2.0 * h['std_m'] for h in shown], 'color': colour},
                 mode='markers',
-                marker={
-                    'color': colour,
-                    'size': 9,
-                    'symbol': 'circle' if judged else 'circle-open',
-                },
+                marker={'color': colour, 'size': 9, 'symbol': symbol},
                 name=f'crossing {number}' + ('' if judged else ', not judged'),
             )
     figure.add_vline(x=0.0, line_width=1)
     rows = sum(len(crossing['horizons']) for crossing in metrics['crossings'])
     title = f'{metrics["line_a"]} minus {metrics["line_b"]} [m], with two standard deviations'
-    return styled(
-        figure, 160 + 34 * rows, {'title': title}, {'type': 'category', 'autorange': 'reversed'}
-    )
+    down = {'type': 'category', 'autorange': 'reversed'}
+    return figure.styled(160 + 34 * rows, {'title': title}, down)
 
 
 def _line(folder: RunFolder) -> Line:
@@ -232,28 +226,11 @@ def _line(folder: RunFolder) -> Line:
         raise BagError(f'{folder.path}: fewer than two records have a place')
     kept = tuple(record for record, good in zip(records, there) if good)
     config = FathometerConfig.from_mapping(run['parameters'], ignore_unknown=True)
-    depth = tracked_depths(run, config)
-    return Line(
-        folder.path.name,
-        kept,
-        east[there],
-        north[there],
-        config.min_separation,
-        float(depth[0]),
-        float(depth[-1]),
-        float(depth[1] - depth[0]),
-    )
-
-
-def tracked_depths(run: Mapping[str, Any], config: FathometerConfig) -> FloatArray:
-    """The depths (n,) m on which a run looked for reflectors: as its tracker has them after the
-    first record. Raises `BagError`."""
-    tracker = FathometerTracker(evolve(config, particles=2, smoothing_lag=0, preview_seconds=0.0))
-    for measurement in read_measurements(run):
-        tracker.process(measurement)
-        if tracker.response is not None:
-            return tracker.response.depth
-    raise BagError(f'{run["bag"]} holds no record of the fathometer')
+    if (first := next(responses(run), None)) is None:
+        raise BagError(f'{run["bag"]} holds no record of the fathometer')
+    depth = first.depth.tolist()
+    of_depths = config.min_separation, depth[0], depth[-1], depth[1] - depth[0]
+    return Line(folder.path.name, kept, east[there], north[there], *of_depths)
 
 
 def _plane(line: Line, origin: tuple[float, float]) -> FloatArray:
@@ -283,22 +260,16 @@ def _meetings(a: FloatArray, b: FloatArray) -> list[tuple[int, int, float, float
 
 
 def _horizons(line: Line, track: FloatArray, at: float, position_std: float) -> list[Horizon]:
-    """The horizons of a line around the fractional record `at`."""
     way = np.append(0.0, np.cumsum(np.hypot(*np.diff(track, axis=0).T)))
     here = float(np.interp(at, np.arange(len(way)), way))
+    names = ('depth', 'cov_depth_depth', 'is_bottom', 'multiple_probability')
     seen: dict[int, list[tuple[float, ...]]] = {}
     for k in np.flatnonzero(np.abs(way - here) <= REACH):
         columns = line.records[k].columns()
         for row in np.flatnonzero(np.isfinite(columns['depth'])):
-            seen.setdefault(int(columns['track_id'][row]), []).append(
-                (
-                    float(way[k]) - here,
-                    float(columns['depth'][row]),
-                    float(columns['cov_depth_depth'][row]),
-                    float(columns['is_bottom'][row]),
-                    float(columns['multiple_probability'][row]),
-                )
-            )
+            values = (float(columns[name][row]) for name in names)
+            rows = seen.setdefault(int(columns['track_id'][row]), [])
+            rows.append((float(way[k]) - here, *values))
     horizons = []
     for track_id, rows in seen.items():
         ahead, depth, variance, bottom, multiple = (np.array(column) for column in zip(*rows))
@@ -316,17 +287,8 @@ def _horizons(line: Line, track: FloatArray, at: float, position_std: float) -> 
         std = float(np.sqrt(max(variance[near], scatter)))
         place = float(depth[near] - slope * ahead[near])
         within = min(depth[near] - line.first, line.last - depth[near])
-        horizons.append(
-            Horizon(
-                track_id,
-                place,
-                std,
-                slope,
-                float(bottom[near]),
-                float(multiple[near]),
-                bool(within <= line.step),
-            )
-        )
+        kind = float(bottom[near]), float(multiple[near]), bool(within <= line.step)
+        horizons.append(Horizon(track_id, place, std, slope, *kind))
     return sorted(horizons, key=lambda horizon: horizon.depth)
 
 
@@ -385,9 +347,7 @@ def common_shift(judged: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     state, its standard deviation, and what it leaves; nothing for fewer than two."""
     if len(judged) < 2:
         return {}
-    difference, std = (
-        np.array([pair[key] for pair in judged]) for key in ('difference_m', 'std_m')
-    )
+    difference, std = _columns(judged, 'difference_m', 'std_m')
     weight = std**-2
     shift = float(weight @ difference / weight.sum())
     left = difference - shift
@@ -399,10 +359,6 @@ def common_shift(judged: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         'residual_rms_m': float(np.sqrt(left @ left / free)),
         'residual_rms_sigmas': float(np.sqrt(weight @ left**2 / free)),
     }
-
-
-def _between(values: FloatArray, row: int, share: float) -> float:
-    return float(values[row] + share * (values[row + 1] - values[row]))
 
 
 def _columns(pairs: Sequence[Mapping[str, Any]], *keys: str) -> tuple[FloatArray, ...]:

@@ -15,14 +15,14 @@ from typing import Any
 
 from attrs import evolve
 import numpy as np
-import plotly.graph_objects as go
 
 from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.trackers.fathometer.response import Response
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 from ... import SECOND
 from ...offline.run_folder import read_measurements
-from ..plotting import add_image, add_line, add_points, BARE, COLOURS, INK, styled, TIME
+from ..plotting import BARE, COLOURS, INK, Picture, TIME
 from ..report import Section
 from .scoring import Image, pair, Record, Reflections
 
@@ -67,102 +67,88 @@ def sections(
         )
 
 
-def response_image(run: Mapping[str, Any]) -> Image | None:
-    """The depth responses of a run as its tracker saw them; None when its recording is gone.
+def responses(run: Mapping[str, Any]) -> Iterator[Response]:
+    """The depth responses of a run as its tracker saw them; none when its recording is gone.
 
     They are computed again by a tracker with two particles, whose estimates are not used.
     """
     config = FathometerConfig.from_mapping(run['parameters'], ignore_unknown=True)
     tracker = FathometerTracker(evolve(config, particles=2, smoothing_lag=0, preview_seconds=0.0))
-    columns, depths, last = [], None, None
+    last = None
     for measurement in read_measurements(run):
         tracker.process(measurement)
-        response = tracker.response
-        if response is None or response is last:
-            continue
-        last = response
-        if depths is None:
-            depths = response.depth
-        if len(response.depth) == len(depths):
-            columns.append((response.stamp_ns, response.amplitude / response.sigma))
-    if depths is None:
+        if tracker.response is not None and tracker.response is not last:
+            last = tracker.response
+            yield last
+
+
+def response_image(run: Mapping[str, Any]) -> Image | None:
+    """The `responses` of a run side by side, those with the depths of the first."""
+    seen = list(responses(run))
+    if not seen:
         return None
-    columns.sort(key=lambda column: column[0])
-    return Image(
-        np.array([value for _, value in columns]).T,
-        depths,
-        np.array([stamp for stamp, _ in columns], np.int64),
-    )
+    depths = seen[0].depth
+    seen = [each for each in seen if len(each.depth) == len(depths)]
+    seen.sort(key=lambda response: response.stamp_ns)
+    values = np.array([response.amplitude / response.sigma for response in seen])
+    return Image(values.T, depths, np.array([each.stamp_ns for each in seen], np.int64))
 
 
-def response_figure(image: Image | None, records: Sequence[Record], start_ns: int) -> go.Figure:
+def response_figure(image: Image | None, records: Sequence[Record], start_ns: int) -> Picture:
     """The response as an image, with the truth as dots and the tracks as lines."""
-    figure = go.Figure()
+    figure = Picture()
     if image is not None:
         image = _thinned(image)
         most = float(max(6.0, np.nanpercentile(image.value, 99.7)))
-        add_image(
-            figure,
-            (image.stamp_ns - start_ns) / SECOND,
-            image.depth,
-            np.round(image.value, 2),
-            'response / noise',
-            limits=(0.0, most),
-            colours='Greys',
-            showscale=True,
-            hoverinfo='skip',
-        )
+        look: dict[str, Any] = {'title': 'response / noise', 'limits': (0.0, most)}
+        look |= {'colours': 'Greys', 'showscale': True, 'hoverinfo': 'skip'}
+        time = (image.stamp_ns - start_ns) / SECOND
+        figure.image(time, image.depth, np.round(image.value, 2), **look)
     _add_truth(figure, records, lambda true: true.depth, start_ns, 'truth')
     _add_tracks(figure, records, 'depth', start_ns, mode='lines+markers', marker={'size': 4})
     y = {'title': 'depth [m]', 'autorange': 'reversed', 'showgrid': False}
-    return styled(figure, 520, OVER_TIME, y)
+    return figure.styled(520, OVER_TIME, y)
 
 
-def order_figure(records: Sequence[Record], start_ns: int) -> go.Figure:
+def order_figure(records: Sequence[Record], start_ns: int) -> Picture:
     """The PMF of the number of reflectors over time, and the true number."""
     pmf = np.array([record.pmf for record in records]).T
-    figure = go.Figure()
-    add_image(
-        figure,
+    figure = Picture()
+    figure.image(
         _seconds(records, start_ns),
         records[0].order_min + np.arange(len(pmf)),
         np.round(pmf, 4),
         hovertemplate='%{x:.0f} s, %{y} reflectors: %{z:.3f}<extra></extra>',
     )
     if known := _known(records):
-        figure.add_scattergl(
-            x=_seconds([record for record, _ in known], start_ns),
-            y=[len(true) for _, true in known],
-            mode='lines',
-            name='truth',
-            line={'color': COLOURS[1], 'width': 2, 'shape': 'hv'},
-            showlegend=True,
-        )
+        time, count = _seconds([r for r, _ in known], start_ns), [len(true) for _, true in known]
+        steps = {'color': COLOURS[1], 'width': 2, 'shape': 'hv'}
+        figure.line(time, count, 'truth', COLOURS[1], gl=True, line=steps, showlegend=True)
     y = {'title': 'number of reflectors', 'dtick': 1} | BARE
-    return styled(figure, 360, OVER_TIME, y)
+    return figure.styled(360, OVER_TIME, y)
 
 
 def amplitude_figure(
     records: Sequence[Record], start_ns: int, factor: float | None = None
-) -> go.Figure:
+) -> Picture:
     """Amplitude of every track over time, and the true amplitudes times `factor`."""
-    figure = go.Figure()
+    figure = Picture()
     if factor:
         name = 'truth, at the same scale'
         _add_truth(figure, records, lambda true: factor * true.strength, start_ns, name)
     _add_tracks(figure, records, 'strength', start_ns)
     y = {'title': 'amplitude, freed of spreading', 'rangemode': 'tozero'}
-    return styled(figure, 360, TIME, y)
+    return figure.styled(360, TIME, y)
 
 
-def distance_figure(records: Sequence[Record], cutoff: float, start_ns: int) -> go.Figure:
+def distance_figure(records: Sequence[Record], cutoff: float, start_ns: int) -> Picture:
     """OSPA of every record with truth."""
     known = _known(records)
     ospa = np.array([pair(record.found.depth, t.depth, cutoff).ospa for record, t in known])
-    figure = go.Figure()
+    figure = Picture()
     time = _seconds([record for record, _ in known], start_ns)
-    add_line(figure, time, ospa, None, INK, 1.2, gl=True)
-    return styled(figure, 280, TIME, {'title': 'OSPA [m]', 'rangemode': 'tozero'})
+    figure.line(time, ospa, None, INK, 1.2, gl=True)
+    return figure.styled(280, TIME, {'title': 'OSPA [m]', 'rangemode': 'tozero'})
 
 
 def _known(records: Sequence[Record]) -> list[tuple[Record, Reflections]]:
@@ -171,7 +157,7 @@ def _known(records: Sequence[Record]) -> list[tuple[Record, Reflections]]:
 
 
 def _add_truth(
-    figure: go.Figure,
+    figure: Picture,
     records: Sequence[Record],
     values: Callable[[Reflections], FloatArray],
     start_ns: int,
@@ -181,11 +167,11 @@ def _add_truth(
     if known := _known(records):
         each = [values(true) for _, true in known]
         time = np.repeat(_seconds([record for record, _ in known], start_ns), list(map(len, each)))
-        add_points(figure, time, np.concatenate(each), name, COLOURS[4], 3)
+        figure.points(time, np.concatenate(each), name, COLOURS[4], 3)
 
 
 def _add_tracks(
-    figure: go.Figure, records: Sequence[Record], what: str, start_ns: int, **look: Any
+    figure: Picture, records: Sequence[Record], what: str, start_ns: int, **look: Any
 ) -> None:
     """A line for every reflector: `what` of it over time."""
     places: dict[int, list[tuple[float, float]]] = {}
@@ -196,7 +182,7 @@ def _add_tracks(
         times, values = zip(*rows)
         name = f'reflector {track_id}'
         further = {'showlegend': False} | look
-        add_line(figure, times, values, name, COLOURS[index % 4], 1.5, gl=True, **further)
+        figure.line(times, values, name, COLOURS[index % 4], 1.5, gl=True, **further)
 
 
 def _seconds(records: Sequence[Record], start_ns: int) -> list[float]:

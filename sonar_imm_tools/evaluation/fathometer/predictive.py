@@ -58,16 +58,14 @@ def for_tuning(config: FathometerConfig) -> FathometerConfig:
 
 def tunables(config: FathometerConfig, measurements: Sequence[Any]) -> list[Tunable]:
     """The noise only of traces that do not state it."""
-    found = [Tunable(name='depth_std', start=config.depth_std, step=STEP)]
+    found = [Tunable.of(config, 'depth_std', step=STEP)]
     traces = [item for item in measurements if isinstance(item, Trace)]
     if traces and all(trace.sigma is None for trace in traces):
         start = config.noise_sigma or _measured(config, traces)
         found.insert(0, Tunable(name='noise_sigma', start=start, step=STEP))
-    start = config.amplitude_std_sigmas
-    found.append(Tunable(name='amplitude_std_sigmas', start=start, step=STEP, usual=False))
+    found.append(Tunable.of(config, 'amplitude_std_sigmas', step=STEP, usual=False))
     if config.pulse == 'gaussian':
-        start = config.pulse_width
-        found.append(Tunable(name='pulse_width', start=start, step=STEP, usual=False))
+        found.append(Tunable.of(config, 'pulse_width', step=STEP, usual=False))
     return found
 
 

@@ -133,15 +133,11 @@ def _record(estimate: Estimate, true: Reflections | None) -> Record:
 
 
 def _true(estimate: Estimate) -> Reflections:
-    columns = read_columns(
-        estimate, _TRUE, "the truth is not that of reflectors: it has no column '{}'"
-    )
-    ids = columns['track_id']
+    missing = "the truth is not that of reflectors: it has no column '{}'"
+    depth, amplitude, ids = read_columns(estimate, _TRUE, missing).values()
     ids = np.where(np.isfinite(ids), ids, np.arange(len(ids)))
-    there = np.isfinite(columns['depth'])
-    return Reflections(
-        columns['depth'][there], columns['amplitude'][there], ids[there].astype(np.int64)
-    )
+    there = np.isfinite(depth)
+    return Reflections(depth[there], amplitude[there], ids[there].astype(np.int64))
 
 
 CUTOFF = 2.0
@@ -156,6 +152,10 @@ class Pairing(NamedTuple):
     found: NDArray[np.intp]
     true: NDArray[np.intp]
     ospa: float
+
+
+Scored = list[tuple[Record, Reflections, Pairing]]
+"""Records, each with its truth, and which reflector is which."""
 
 
 def pair(found: FloatArray, true: FloatArray, cutoff: float) -> Pairing:
@@ -180,42 +180,38 @@ def score(records: Sequence[Record], cutoff: float = CUTOFF) -> dict[str, Any]:
         'ids': len({int(i) for record in committed for i in record.found.track_id}),
         'cutoff_m': cutoff,
     }
-    scored = [(record, record.true) for record in committed if record.true is not None]
-    if scored:
-        metrics.update(_against_truth(scored, cutoff))
-    return metrics
+    scored = [
+        (record, record.true, pair(record.found.depth, record.true.depth, cutoff))
+        for record in committed
+        if record.true is not None
+    ]
+    return metrics | (_against_truth(scored) if scored else {})
 
 
-def _against_truth(scored: Sequence[tuple[Record, Reflections]], cutoff: float) -> dict[str, Any]:
-    pairs = [pair(record.found.depth, true.depth, cutoff) for record, true in scored]
-    error = np.concatenate(
-        [r.found.depth[p.found] - t.depth[p.true] for (r, t), p in zip(scored, pairs)]
-    )
-    std = np.concatenate([r.depth_std[p.found] for (r, _), p in zip(scored, pairs)])
-    extra = [len(r.found) - len(p.found) for (r, _), p in zip(scored, pairs)]
+def _against_truth(scored: Scored) -> dict[str, Any]:
+    error = np.concatenate([r.found.depth[p.found] - t.depth[p.true] for r, t, p in scored])
+    std = np.concatenate([r.depth_std[p.found] for r, _, p in scored])
     return {
         'scored_records': len(scored),
-        'order_right': _mean([record.order == len(true) for record, true in scored]),
-        'ospa_m': _mean([p.ospa for p in pairs]),
-        'false_per_record': _mean(extra),
-        'missed_per_record': _mean([len(t) - len(p.true) for (_, t), p in zip(scored, pairs)]),
+        'order_right': _mean([r.order == len(t) for r, t, _ in scored]),
+        'ospa_m': _mean([p.ospa for _, _, p in scored]),
+        'false_per_record': _mean([len(r.found) - len(p.found) for r, _, p in scored]),
+        'missed_per_record': _mean([len(t) - len(p.true) for _, t, p in scored]),
         'depth': {
             **error_summary(np.abs(error)),
             'bias_m': _mean(error),
             'inside_2_sigma': _mean(np.abs(error) <= 2.0 * std),
         },
-        'amplitude': _amplitudes(scored, pairs),
-        'existence': _existence(scored, pairs),
-        'identity_switches': _switches(scored, pairs),
+        'amplitude': _amplitudes(scored),
+        'existence': _existence(scored),
+        'identity_switches': _switches(scored),
     }
 
 
-def _amplitudes(
-    scored: Sequence[tuple[Record, Reflections]], pairs: Sequence[Pairing]
-) -> dict[str, float]:
+def _amplitudes(scored: Scored) -> dict[str, float]:
     """Relative errors after one common factor, because a passive array measures ratios only."""
-    found = np.concatenate([r.found.strength[p.found] for (r, _), p in zip(scored, pairs)])
-    true = np.concatenate([t.strength[p.true] for (_, t), p in zip(scored, pairs)])
+    found = np.concatenate([r.found.strength[p.found] for r, _, p in scored])
+    true = np.concatenate([t.strength[p.true] for _, t, p in scored])
     use = np.isfinite(found) & (true > 0.0)
     if not use.any():
         return {'n': 0}
@@ -230,14 +226,10 @@ def _amplitudes(
     }
 
 
-def _existence(
-    scored: Sequence[tuple[Record, Reflections]], pairs: Sequence[Pairing]
-) -> dict[str, float]:
+def _existence(scored: Scored) -> dict[str, float]:
     """Stated probability of existence, and the share that was true."""
-    stated = np.concatenate([record.existence for record, _ in scored])
-    right = np.concatenate(
-        [np.isin(np.arange(len(r.found)), p.found) for (r, _), p in zip(scored, pairs)]
-    )
+    stated = np.concatenate([r.existence for r, _, _ in scored])
+    right = np.concatenate([np.isin(np.arange(len(r.found)), p.found) for r, _, p in scored])
     doubtful = stated < 0.95
     return {
         'stated_mean': _mean(stated),
@@ -248,13 +240,13 @@ def _existence(
     }
 
 
-def _switches(scored: Sequence[tuple[Record, Reflections]], pairs: Sequence[Pairing]) -> int:
+def _switches(scored: Scored) -> int:
     """How often a true reflector is found under another id than before."""
     last: dict[int, int] = {}
     switches = 0
-    for (record, true), p in zip(scored, pairs):
-        for row, column in zip(p.found, p.true):
-            who, name = int(true.track_id[column]), int(record.found.track_id[row])
+    for record, true, p in scored:
+        found = record.found.track_id[p.found].tolist()
+        for who, name in zip(true.track_id[p.true].tolist(), found):
             switches += last.get(who, name) != name
             last[who] = name
     return switches

@@ -15,21 +15,16 @@ present it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
 
-from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
 
-from ...offline.run_folder import read_measurements, read_truth, RunFolder
-from ..judging import JudgeOptions, Limit, naming, Scored
+from ..judging import Case, Limit
 from ..numbers import chi2, counted, each, error, fill, look_up, Metric, NO_TRUTH, UNMATCHED
 from .scoring import motion_metrics, NEAR, score, tether_length
 from .series import series_of, truth_of
-
-if TYPE_CHECKING:
-    from ..report import Section
 
 __all__ = ['LIMIT', 'METRICS', 'REMARK', 'scored', 'SEEN', 'summary_sentence']
 
@@ -44,31 +39,19 @@ CUTOFF = 5.0
 """Metres in range and bearing from which a track is on no obstacle."""
 
 
-def scored(folder: RunFolder, run: Mapping[str, Any], options: JudgeOptions) -> Scored:
-    """Score the tracks of `folder`. Raises `BagError` when they or the truth cannot be read."""
-    with naming(folder.path):
-        series = series_of(folder.read_estimates())
-    tables = read_truth(run, options.truth_bag)
-    with naming(options.truth_bag or Path(run['bag'])):
-        truth = truth_of(tables or (), options.lag)
+def scored(case: Case) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    """Score the tracks of a run against true obstacles."""
+    options, config = case.options, case.config(ObstacleConfig)
+    series = case.estimates(series_of)
+    truth = case.truth(partial(truth_of, lag=options.lag)) or ()
     cutoff = CUTOFF if options.cutoff is None else options.cutoff
     metrics, found = score(series, truth, cutoff=cutoff, gap=options.gap)
     metrics['truth_lag_s'] = options.lag
-    config = ObstacleConfig.from_mapping(run['parameters'], ignore_unknown=True)
     if found is not None:
         metrics |= motion_metrics(found, truth, config)
-    received = list(read_measurements(run))
+    received = list(case.measurements())
     metrics |= tether_length(series, received, config)
-
-    def sections() -> Iterable[Section]:
-        # plotly, which only a report needs, takes a second to load.
-        from .figures import map_section, sections
-
-        origin = Origin(**run['origin']) if run.get('origin') else None
-        yield from map_section(series, received, origin)
-        yield from sections(metrics, series, truth, found, received, options.gap)
-
-    return metrics, sections
+    return metrics, (metrics, series, truth, found, received, options.gap, case.origin())
 
 
 # fmt: off

@@ -14,16 +14,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS
 
 from ..plotting import (
-    add_band,
-    add_line,
-    add_points,
     AMBER,
     COLOURS,
     GREY,
@@ -31,8 +27,8 @@ from ..plotting import (
     INK,
     MOST_POINTS,
     nis_figure,
+    Picture,
     seconds,
-    styled,
     thin,
     TRUTH,
     view_of,
@@ -51,9 +47,11 @@ def sections(
     found: Matching | None,
     received: Sequence[Any],
     gap: float,
+    origin: Origin | None,
 ) -> Iterator[Section]:
     """The sections of one run. metrics: content of ``metrics.json``; received: the measurements;
-    gap: seconds without truth across which it is not interpolated."""
+    gap: seconds without truth across which it is not interpolated; origin: as `map_section`."""
+    yield from map_section(series, received, origin)
     yield Section(
         'Height over range',
         'How far each obstacle lies below the sonar, as it comes nearer from left to right. '
@@ -127,16 +125,16 @@ def map_section(
     way = np.array([item.position[:2] for item in received if isinstance(item, Navigation)])
     if not (len(way) and len(series)):
         return
-    figure = go.Figure()
+    figure = Picture()
     x, y = way[thin(len(way), MOST_POINTS)].T
-    add_line(figure, x, y, 'vehicle', INK, 2)
+    figure.line(x, y, 'vehicle', INK, 2)
     for name, colour, track in _by_track(series):
         x, y = track.place[thin(len(track), MOST_POINTS)].T
-        add_points(figure, x, y, name, colour)
+        figure.points(x, y, name, colour)
         figure.data[-1].hovertemplate = f'{name}: x %{{x:.1f}}, y %{{y:.1f}}'
     x_range, y_range = view_of(np.concatenate([way, series.place]))
     along = {'title': 'y [m]', 'range': y_range, 'scaleanchor': 'x', 'scaleratio': 1}
-    styled(figure, 480, {'title': 'x [m]', 'range': x_range}, along)
+    figure.styled(480, {'title': 'x [m]', 'range': x_range}, along)
     yield Section(
         'Map',
         'Seen from above: the way of the vehicle, and where each track has its obstacle.',
@@ -153,73 +151,72 @@ def _truths(found: Matching | None, truth: Sequence[TruePath]) -> dict[int, True
 
 
 def _by_track(series: Series) -> Iterator[tuple[str, str, Series]]:
-    """Name, colour and rows of each track."""
     for order, track_id in enumerate(np.unique(series.track_id).tolist()):
         rows = series.pick(series.track_id == track_id)
         yield f'track {track_id}', COLOURS[order % len(COLOURS)], rows
 
 
-def offset_figure(series: Series, truths: dict[int, TruePath], gap: float) -> go.Figure:
+def offset_figure(series: Series, truths: dict[int, TruePath], gap: float) -> Picture:
     """Vertical offset of each track with its 90 % band over the range, far to near."""
-    figure = go.Figure()
+    figure = Picture()
     for name, colour, track in _by_track(series):
         near = track.state[:, 0]
         hidden: dict[str, Any] = {'legendgroup': name, 'showlegend': False}
-        add_band(figure, near, track.low, track.high, colour, (0.15, 0.4), **hidden)
-        add_line(figure, near, track.state[:, 2], name, colour, legendgroup=name)
+        figure.band(near, track.low, track.high, colour, (0.15, 0.4), **hidden)
+        figure.line(near, track.state[:, 2], name, colour, legendgroup=name)
         if (path := truths.get(int(track.track_id[0]))) is not None:
             seen = path.at(track.stamp_ns, gap)
             figure.add_scatter(x=seen[:, 0], y=seen[:, 2], mode='lines', line=TRUTH, **hidden)
     y = {'title': 'below the sonar [m]', 'autorange': 'reversed'}
-    return styled(figure, 440, NEARING, y)
+    return figure.styled(440, NEARING, y)
 
 
 def image_figure(
     series: Series, pings: Sequence[Detections], truths: Sequence[TruePath]
-) -> go.Figure:
+) -> Picture:
     """Tracks and echoes in the image of the sonar, ahead is up."""
-    figure = go.Figure()
+    figure = Picture()
     if pings:
         echoes = np.concatenate([np.column_stack([ping.range, ping.bearing]) for ping in pings])
         shown = level(echoes[thin(len(echoes), MOST_POINTS)])
-        add_points(figure, -shown[:, 1], shown[:, 0], 'detections', GREY, 3)
+        figure.points(-shown[:, 1], shown[:, 0], 'detections', GREY, 3)
         figure.data[-1].hoverinfo = 'skip'
     for path in truths:
         flat = level(path.seen[path.in_beam])
         legend: dict[str, Any] = {'legendgroup': 'truth', 'showlegend': path is truths[0]}
-        add_line(figure, -flat[:, 1], flat[:, 0], 'truth', INK, line=TRUTH, **legend)
+        figure.line(-flat[:, 1], flat[:, 0], 'truth', INK, line=TRUTH, **legend)
     for name, colour, track in _by_track(series):
         flat = level(track.state)
-        add_line(figure, -flat[:, 1], flat[:, 0], name, colour)
+        figure.line(-flat[:, 1], flat[:, 0], name, colour)
     y = {'title': 'ahead [m]', 'scaleanchor': 'x', 'scaleratio': 1, 'rangemode': 'tozero'}
-    return styled(figure, 620, {'title': 'to starboard [m]'}, y)
+    return figure.styled(620, {'title': 'to starboard [m]'}, y)
 
 
-def above_figure(series: Series) -> go.Figure:
+def above_figure(series: Series) -> Picture:
     """Probability that the obstacle is above the sonar, over the range."""
-    figure = go.Figure()
+    figure = Picture()
     for name, colour, track in _by_track(series):
-        add_line(figure, track.state[:, 0], track.above, name, colour)
-    return styled(figure, 280, NEARING, {'title': 'P(above)', 'range': [-0.02, 1.02]})
+        figure.line(track.state[:, 0], track.above, name, colour)
+    return figure.styled(280, NEARING, {'title': 'P(above)', 'range': [-0.02, 1.02]})
 
 
-def error_figure(found: Matching) -> go.Figure:
+def error_figure(found: Matching) -> Picture:
     """Error of the offset over its stated standard deviation, against the range."""
     sigmas = found.error[:, 2] / np.sqrt(found.series.covariance[found.row, 2, 2])
-    figure = go.Figure()
+    figure = Picture()
     look = {'fillcolor': AMBER, 'opacity': 0.2, 'line_width': 0}
     figure.add_hrect(y0=-1.645, y1=1.645, annotation_text='9 in 10 should lie here', **look)
     name = 'error / stated sigma'
-    add_points(figure, found.truth[:, 0], sigmas, name, COLOURS[0], opacity=0.6)
-    return styled(figure, 320, NEARING, {'title': 'offset error / sigma'})
+    figure.points(found.truth[:, 0], sigmas, name, COLOURS[0], opacity=0.6)
+    return figure.styled(320, NEARING, {'title': 'offset error / sigma'})
 
 
-def calibration_figure(bins: Mapping[str, Mapping[str, float]]) -> go.Figure:
+def calibration_figure(bins: Mapping[str, Mapping[str, float]]) -> Picture:
     """How often what was stated with a probability came true, by bins of it; the area of a point
     is the number of forecasts."""
     stated, came, n = ([b[name] for b in bins.values()] for name in ('stated', 'came_true', 'n'))
-    figure = go.Figure()
-    add_line(figure, [0, 1], [0, 1], 'as stated', INK, line=TRUTH)
+    figure = Picture()
+    figure.line([0, 1], [0, 1], 'as stated', INK, line=TRUTH)
     figure.add_scatter(
         x=stated,
         y=came,
@@ -230,4 +227,4 @@ def calibration_figure(bins: Mapping[str, Mapping[str, float]]) -> go.Figure:
         marker={'size': [6.0 + 18.0 * (count / max(n)) ** 0.5 for count in n]},
     )
     x = {'title': 'stated probability', 'range': [-0.03, 1.03]}
-    return styled(figure, 360, x, {'title': 'share that happened', 'range': [-0.03, 1.03]})
+    return figure.styled(360, x, {'title': 'share that happened', 'range': [-0.03, 1.03]})

@@ -40,17 +40,13 @@ def tunables(config: ObstacleConfig, measurements: Sequence[Any]) -> list[Tunabl
     pings = [item for item in measurements if isinstance(item, Detections)]
     found = []
     if any(np.isnan(ping.var_range).any() for ping in pings):
-        found.append(Tunable(name='range_std', start=config.range_std, scanned=True))
+        found.append(Tunable.of(config, 'range_std', scanned=True))
     if any(np.isnan(ping.var_bearing).any() for ping in pings):
-        bearing = config.bearing_std_deg
-        found.append(Tunable(name='bearing_std_deg', start=bearing, scanned=True))
-    p = config.detection_probability
-    found.append(Tunable(name='detection_probability', start=p, kind='logit'))
-    if config.clutter_density > 0.0:
-        found.append(Tunable(name='clutter_density', start=config.clutter_density))
-    for name in ('sway_std', 'max_speed'):
-        if (start := getattr(config, name)) > 0.0:
-            found.append(Tunable(name=name, start=start, usual=False))
+        found.append(Tunable.of(config, 'bearing_std_deg', scanned=True))
+    found.append(Tunable.of(config, 'detection_probability', kind='logit'))
+    for name in ('clutter_density', 'sway_std', 'max_speed'):
+        if getattr(config, name) > 0.0:
+            found.append(Tunable.of(config, name, usual=name == 'clutter_density'))
     return found
 
 

@@ -37,9 +37,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 from sonar_imm.estimation.consistency import identity_switches, interval_coverage
 from sonar_imm.measurements import Altitude, Measurement
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
@@ -57,12 +56,12 @@ def score(
     series: Series, truth: tuple[TruePath, ...] | None, *, cutoff: float, gap: float
 ) -> tuple[dict[str, Any], Matching | None]:
     """All metrics of a run, and the matching they rest on. Without truth only what needs none."""
-    pings = series.scan_ns
+    pings, tracks = series.scan_ns, len(np.unique(series.track_id))
     nis = series.nis[np.isfinite(series.nis)]
     metrics: dict[str, Any] = {
         'pings': len(pings),
         'span_s': float(np.ptp(pings)) / SECOND if len(pings) else 0.0,
-        'tracks_confirmed': len(np.unique(series.track_id)),
+        'tracks_confirmed': tracks,
         'rows_confirmed': len(series),
         'consistency': {'nis': chi2_summary(nis, 2)},
     }
@@ -83,9 +82,8 @@ def score(
         'tracks': {
             'true_obstacles': len(truth),
             'found_obstacles': len(np.unique(found.target)),
-            'tracks': metrics['tracks_confirmed'],
-            'false_tracks': metrics['tracks_confirmed']
-            - len(np.unique(series.track_id[found.row])),
+            'tracks': tracks,
+            'false_tracks': tracks - len(np.unique(series.track_id[found.row])),
             'identity_switches': identity_switches(followed_by(found, len(truth))),
         },
     }
@@ -105,7 +103,7 @@ def truth_consistency(found: Matching) -> dict[str, Any]:
     }
 
 
-def followed_by(found: Matching, obstacles: int) -> NDArray[np.int64]:
+def followed_by(found: Matching, obstacles: int) -> IntArray:
     """(pings, obstacles) id of the track on each obstacle, -1 without."""
     series = found.series
     followed = np.full((len(series.scan_ns), obstacles), -1, np.int64)
@@ -123,7 +121,7 @@ def above_calibration(found: Matching) -> dict[str, Any]:
 
 
 def binned(
-    stated: FloatArray, true: NDArray[np.bool_], edges: Sequence[float]
+    stated: FloatArray, true: BoolArray, edges: Sequence[float]
 ) -> dict[str, dict[str, float]]:
     """How often what was stated (m,) is true (m,), by ranges of the stated probability."""
     which = np.clip(np.searchsorted(edges, stated, side='right') - 1, 0, len(edges) - 2)
@@ -214,23 +212,18 @@ def behaviour_scores(found: Matching, truth: Sequence[TruePath]) -> dict[str, An
     if not len(rows):
         return {}
     true = np.array([truth[found.target[k]].does[at[k]] for k in rows])
-    confusion = {
-        BEHAVIOURS[kind]: {
-            'n': int((true == kind).sum()),
-            **{
-                name: float(stated[rows][true == kind, i].mean())
-                for i, name in enumerate(BEHAVIOURS)
-            },
-        }
-        for kind in np.unique(true)
-    }
+    confusion: dict[str, dict[str, float]] = {}
+    for kind in np.unique(true):
+        means = stated[rows][true == kind].T
+        each = {name: float(np.mean(column)) for name, column in zip(BEHAVIOURS, means)}
+        confusion[BEHAVIOURS[kind]] = {'n': int((true == kind).sum()), **each}
     off = stated[rows] - np.eye(len(BEHAVIOURS))[true]
     return {'confusion': confusion, 'brier': float(np.mean(np.sum(off**2, axis=1)))}
 
 
 def forecasts(
     found: Matching, truth: Sequence[TruePath], config: ObstacleConfig
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+) -> tuple[FloatArray, BoolArray]:
     """Stated probabilities (m,) of which the outcome is known, and whether it happened (m,)."""
     stated, came = [], []
     outcomes = [_outcomes(path, config) for path in truth]
@@ -243,7 +236,7 @@ def forecasts(
     return np.array(stated, float), np.array(came, bool)
 
 
-def forecast_scores(stated: FloatArray, came: NDArray[np.bool_]) -> dict[str, Any]:
+def forecast_scores(stated: FloatArray, came: BoolArray) -> dict[str, Any]:
     """Brier score and bins of forecasts (m,) and what came of them (m,)."""
     if not len(stated):
         return {}
@@ -263,9 +256,8 @@ def _outcomes(path: TruePath, config: ObstacleConfig) -> FloatArray:
     t = path.stamp_ns / SECOND
     distance, _, offset = path.seen.T
     level = np.sqrt(np.maximum(distance**2 - offset**2, 0.0))
-    hits = np.flatnonzero(
-        (level <= config.safety_radius) & (np.abs(offset) <= config.safety_height)
-    )
+    near = level <= config.safety_radius
+    hits = np.flatnonzero(near & (np.abs(offset) <= config.safety_height))
     outcome = np.full(len(t), np.nan)
     # Passed: it was nearest before the end, and is out of reach when the truth ends.
     nearest = int(np.argmin(level))
@@ -279,7 +271,7 @@ def _outcomes(path: TruePath, config: ObstacleConfig) -> FloatArray:
     return outcome
 
 
-def _newest(found: Matching, truth: Sequence[TruePath]) -> NDArray[np.int64]:
+def _newest(found: Matching, truth: Sequence[TruePath]) -> IntArray:
     """Index into the obstacle's truth, the newest of each matched row (m,)."""
     stamps = found.series.stamp_ns[found.row]
     at = np.zeros(len(found.row), np.int64)

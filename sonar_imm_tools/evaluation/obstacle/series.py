@@ -18,11 +18,10 @@ from collections.abc import Iterable
 
 from attrs import frozen
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.angles import wrap_angle
-from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS
 
@@ -86,7 +85,7 @@ class TruePath:
     track_id: int
     stamp_ns: IntArray
     seen: FloatArray
-    in_beam: NDArray[np.bool_]
+    in_beam: BoolArray
     velocity: FloatArray | None = None
     does: IntArray | None = None
 
@@ -96,12 +95,11 @@ class TruePath:
         start, end = self.stamp_ns[after - 1], self.stamp_ns[after]
         fraction = (stamp_ns - start) / np.maximum(end - start, 1)
         known = (fraction >= 0.0) & (fraction <= 1.0) & (end - start <= gap * SECOND)
-        between = self.seen[after - 1] + fraction[:, None] * (
-            self.seen[after] - self.seen[after - 1]
-        )
+        before = self.seen[after - 1]
+        between = before + fraction[:, None] * (self.seen[after] - before)
         return np.where(known[:, None], between, np.nan)
 
-    def there(self, stamp_ns: IntArray, gap: float) -> NDArray[np.bool_]:
+    def there(self, stamp_ns: IntArray, gap: float) -> BoolArray:
         """True (m,) where it should be tracked: in the beam for a while and not passed yet."""
         last = np.searchsorted(self.stamp_ns, stamp_ns, side='right') - 1
         seen = np.cumsum(self.in_beam)[np.maximum(last, 0)]
@@ -132,9 +130,8 @@ class Matching:
 
 def series_of(estimates: Iterable[Estimate]) -> Series:
     """The confirmed rows. Raises ValueError for estimates of another system."""
-    series = read_rows(
-        Series, estimates, "the estimates are not those of obstacles: there is no column '{}'"
-    )
+    missing = "the estimates are not those of obstacles: there is no column '{}'"
+    series = read_rows(Series, estimates, missing)
     return series.pick(series.track_state > 0)
 
 
@@ -166,10 +163,8 @@ def match(series: Series, truth: tuple[TruePath, ...], *, cutoff: float, gap: fl
     there = np.array([path.there(pings, gap) for path in truth], bool)
     there = there.reshape(len(truth), len(pings))
     points, flat = level(series.state), level(seen)
-    starts = np.searchsorted(series.stamp_ns, pings, side='left')
-    ends = np.searchsorted(series.stamp_ns, pings, side='right')
     rows, targets, scores = [], [], []
-    for ping, (start, end) in enumerate(zip(starts, ends)):
+    for ping, (start, end) in enumerate(zip(*series.spans(pings))):
         if not np.isfinite(seen[:, ping]).any():
             continue
         who = np.flatnonzero(there[:, ping])
@@ -180,9 +175,8 @@ def match(series: Series, truth: tuple[TruePath, ...], *, cutoff: float, gap: fl
         targets += who[hit].tolist()
     row, target = np.array(rows, np.int64), np.array(targets, np.int64)
     at = np.searchsorted(pings, series.stamp_ns[row])
-    return Matching(
-        series, row, target, seen[target, at].reshape(-1, 3), np.reshape(scores, (-1, 4))
-    )
+    true = seen[target, at].reshape(-1, 3)
+    return Matching(series, row, target, true, np.reshape(scores, (-1, 4)))
 
 
 def level(seen: FloatArray) -> FloatArray:

@@ -66,17 +66,10 @@ class Above(NamedTuple):
 def above(looks: Looks, course: float, side: str, level: float) -> Above:
     """The looks of a ship on a course (rad, from east to north) along a track through the origin,
     over a floor at z = level."""
-    sign = 1.0 if side == 'port' else -1.0
-    axes = np.array(
-        [
-            [math.cos(course), math.sin(course), 0.0],
-            [-sign * math.sin(course), sign * math.cos(course), 0.0],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-    place, stave, broadside = (
-        part @ axes.T for part in (looks.position, looks.stave, looks.broadside)
-    )
+    sign, c, s = 1.0 if side == 'port' else -1.0, math.cos(course), math.sin(course)
+    axes = np.array([[c, s, 0.0], [-sign * s, sign * c, 0.0], [0.0, 0.0, 1.0]])
+    parts = looks.position, looks.stave, looks.broadside
+    place, stave, broadside = (part @ axes.T for part in parts)
     return Above(place[:, 1], place[:, 2] - level, stave, np.cross(stave, broadside))
 
 

@@ -29,7 +29,6 @@ from typing import NamedTuple
 from attrs import frozen
 import numpy as np
 from numpy.random import Generator
-from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from sonar_imm.acoustics import geometry, rays, sounding
@@ -38,9 +37,10 @@ from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Navigation
 from sonar_imm.parameters import parameter
 
-from ..scenario import Scenario
+from ..scenario import Scenario, smoothed
 
-_WAVES = 3
+SWELL_PERIOD = 6.0
+"""Seconds of roll and heave."""
 _ERROR_SECONDS = 1.5
 """Standard deviation of the kernel that smooths the errors of the navigation."""
 _BEFORE, _AFTER = 1.0, 1.0
@@ -63,7 +63,6 @@ class ShipScenario(Scenario):
     pitch_deg: float = parameter(1.0, 'deg', 'rms pitch of the ship', range=(0.0, 20.0))
     yaw_deg: float = parameter(0.8, 'deg', 'rms yaw of the ship', range=(0.0, 20.0))
     heave: float = parameter(0.2, 'm', 'rms heave of the ship', range=(0.0, 10.0))
-    swell_period: float = parameter(6.0, 's', 'period of roll and heave', range=(0.5, 60.0))
     sonar_lever: tuple[float, ...] = parameter((1.5, -0.4, -0.8), 'm',
         'vector from the navigation reference to the array: x forward, y port, z up',
         range=(-100.0, 100.0), kind='float[]')
@@ -148,26 +147,24 @@ def ship_of(config: ShipScenario, sonar_depth: float, rng: Generator) -> Ship:
     def waves(rms: float, period: float) -> Waves:
         share = np.array([1.0, 0.6, 0.4])
         share *= rms * math.sqrt(2.0) / np.linalg.norm(share)
-        periods = period * np.array([1.0, 0.73, 1.31]) * rng.uniform(0.95, 1.05, _WAVES)
-        return Waves(share, 2.0 * np.pi / periods, rng.uniform(0.0, 2.0 * np.pi, _WAVES))
+        periods = period * np.array([1.0, 0.73, 1.31]) * rng.uniform(0.95, 1.05, 3)
+        return Waves(share, 2.0 * np.pi / periods, rng.uniform(0.0, 2.0 * np.pi, 3))
 
-    period = config.swell_period
     return Ship(
         start=np.array([0.0, 0.0, config.water_level - sonar_depth - config.sonar_lever[2]]),
         velocity=config.speed * np.array([math.cos(course), math.sin(course), 0.0]),
         course=course,
-        roll=waves(math.radians(config.roll_deg), period),
-        pitch=waves(math.radians(config.pitch_deg), 0.8 * period),
-        yaw=waves(math.radians(config.yaw_deg), 1.7 * period),
-        heave=waves(config.heave, period),
+        roll=waves(math.radians(config.roll_deg), SWELL_PERIOD),
+        pitch=waves(math.radians(config.pitch_deg), 0.8 * SWELL_PERIOD),
+        yaw=waves(math.radians(config.yaw_deg), 1.7 * SWELL_PERIOD),
+        heave=waves(config.heave, SWELL_PERIOD),
     )
 
 
 def navigation_of(
     config: ShipScenario, ship: Ship, first_ns: int, seconds: float, rng: Generator, frame_id: str
 ) -> list[Navigation]:
-    """What the ship's navigation says from a second before time zero, at `first_ns`, to a second
-    after `seconds`."""
+    """The navigation from a second before time zero, at `first_ns`, to one after `seconds`."""
     count = math.ceil((seconds + _BEFORE + _AFTER) * config.nav_rate) + 1
     t = np.arange(count) / config.nav_rate - _BEFORE
     scale = np.array(
@@ -177,7 +174,10 @@ def navigation_of(
             config.nav_heave_error,
         ]
     )
-    error = scale * _slow(rng, count, _ERROR_SECONDS * config.nav_rate)
+    # Smooth noise (count, 6) of unit variance.
+    width = _ERROR_SECONDS * config.nav_rate
+    white = rng.normal(size=(count + 8 * math.ceil(width), 6))
+    error = scale * smoothed(white, width)[:count]
     true = ship.pose(t)
     angles = geometry.euler_angles(true.R) + error[:, :3]
     q = Rotation.from_matrix(geometry.rotation(*angles.T)).as_quat()
@@ -191,15 +191,6 @@ def navigation_of(
         )
         for when, place, turn in zip(t, true.position + error[:, 3:], q)
     ]
-
-
-def _slow(rng: Generator, count: int, width: float) -> FloatArray:
-    """Smooth noise (count, 6) of unit variance."""
-    white = rng.normal(size=(count + 8 * math.ceil(width), 6))
-    smooth = gaussian_filter1d(white, width, axis=0, mode='wrap')
-    impulse = np.zeros(len(white))
-    impulse[len(white) // 2] = 1.0
-    return smooth[:count] / np.linalg.norm(gaussian_filter1d(impulse, width, mode='wrap'))
 
 
 class Terrain(NamedTuple):
@@ -232,42 +223,38 @@ class Seen(NamedTuple):
 
 def see(
     config: ShipScenario,
-    ship: Ship,
+    look: sounding.Looks,
     terrain: Terrain,
     roughness: FloatArray,
-    sent: float,
     ranges: FloatArray,
     sound_speed: float,
-    axes: sounding.ArrayAxes,
 ) -> Seen:
-    """What a ping `sent` at a time in s sees at `ranges` (T,); roughness (T,) is the height of
-    each echo above the smooth floor, if it comes from the patch."""
-    lever = np.array(config.sonar_lever)
-    tau = ranges / sound_speed
-    look = sounding.looks(axes, lever, ship.pose(np.array(sent)), ship.pose(sent + 2.0 * tau))
-    p = look.position
+    """What a ping sees at `ranges` (T,); roughness (T,) is the height of each echo above the
+    smooth floor, if it comes from the patch."""
+    p = place = look.position
     z, patch = np.full(len(ranges), terrain.level), np.zeros(len(ranges), bool)
-    place, sine = p.copy(), np.zeros(len(ranges))
-    reached = np.ones(len(ranges), bool)
     for k in range(PASSES):
         if k:
             z, patch = terrain.at(place, roughness)
-        rise, distance, found = _launch(config, p[:, 2], z, ranges, tau)
+        rise, distance, found = _launch(config, p[:, 2], z, ranges, ranges / sound_speed)
         s = rise / look.C
         reached = found & (np.abs(s) <= 1.0)
-        s = np.where(reached, s, 0.0)
-        sine = s * np.cos(look.psi) - np.sqrt(1.0 - s * s) * np.sin(look.psi)
+        sine = sine_from(look, np.where(reached, s, 0.0))
         n = sounding.direction(look, sine)[:, :2]
         outward = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
         place = np.column_stack([p[:, :2] + distance[:, None] * outward, z])
     return Seen(sine, place, patch & reached, reached)
 
 
+def sine_from(look: sounding.Looks, s: FloatArray) -> FloatArray:
+    """Direction sines (T,) along the array of rays that leave at sines `s` (T,) in its fan."""
+    return np.asarray(s * np.cos(look.psi) - np.sqrt(1.0 - s * s) * np.sin(look.psi))
+
+
 def _launch(
     config: ShipScenario, array_z: FloatArray, z: FloatArray, ranges: FloatArray, tau: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Sine (T,) of the elevation at which rays leave for floors at `z`, how far outward they get,
-    and whether they do."""
+    """Sines (T,) of elevation of rays to floors at `z`, how far they get, whether they do."""
     if not config.sound_speed_profile:
         s = (array_z - z) / ranges
         distance = np.sqrt(np.maximum(ranges**2 - (array_z - z) ** 2, 0.0))

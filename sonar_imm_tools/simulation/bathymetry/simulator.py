@@ -18,6 +18,7 @@ moves (`ship`).
 One bin is y = sqrt(z) (s a(u) + n), the observation model of `acoustics.laplace`, or with noise
 that does not fade y = sqrt(z) s a(u) + n. Surface echoes fade with a z of their own. A spike is a
 strong burst of noise, incoherent across the array.
+In one file, since all of it draws from one generator in turn.
 """
 
 from __future__ import annotations
@@ -28,7 +29,6 @@ from typing import Any
 from attrs import evolve, frozen
 import numpy as np
 from numpy.random import Generator
-from scipy.ndimage import gaussian_filter1d
 
 from sonar_imm.acoustics import array, geometry, rays, sounding
 from sonar_imm.estimation.arrays import BoolArray, ComplexArray, FloatArray
@@ -36,13 +36,15 @@ from sonar_imm.measurements import Snapshot
 from sonar_imm.parameters import parameter
 from sonar_imm.truth import Received, Scene, TrueProfile
 
-from ..scenario import FIRST_STAMP_NS, lasting, Scenarios
+from ..scenario import FIRST_STAMP_NS, lasting, Scenarios, smoothed
 from .objects import above, Facets, facets_of, OBJECTS, second_of, surfaces_of
-from .ship import in_outline, navigation_of, see, Ship, ship_of, ShipScenario, Terrain
+from .ship import in_outline, navigation_of, see, Ship, ship_of, ShipScenario, sine_from, Terrain
 
 SIDES = ('starboard', 'port', 'both')
 LAWS = ('laplace', 'gaussian', 'k')
 ROUGHNESS_LAWS = ('gaussian', 'laplace', 'fractal', 'exponential')
+SPIKE_POWER = 100.0
+"""Of bursts of noise over echo and noise."""
 
 
 @frozen(kw_only=True)
@@ -125,7 +127,7 @@ class BathymetryScenario(ShipScenario):
         'slant ranges where shadows begin and end, in pairs', range=(0.0, None), kind='float[]')
     spike_probability: float = parameter(0.0, '',
         'probability that a bin has a burst of noise', range=(0.0, 1.0))
-    spike_db: float = parameter(20.0, 'dB', 'power of bursts of noise above echo and noise')
+
     multipath: bool = parameter(False, '', 'whether a calm surface returns echoes too')
     multipath_level_db: float = parameter(0.0, 'dB',
         'multipath: power of each surface echo relative to the floor', range=(-60.0, 60.0))
@@ -201,7 +203,6 @@ SCENARIOS: Scenarios = {
         {'pings': 60, 'patch_drift': 0.2, 'patch_start': 32.0, 'patch_end': 42.0}),
 }
 # fmt: on
-"""Name: (what it is, what differs from the defaults of `BathymetryScenario`)."""
 
 scenario = BathymetryScenario.among(SCENARIOS)
 
@@ -226,19 +227,18 @@ def simulate(config: BathymetryScenario, seed: int) -> Scene:
         stamp = FIRST_STAMP_NS + round(since_start * 1e9)
         for side in sides:
             namespace = side if len(sides) > 1 else ''
+            look = facets = floor = None
             if ship is None:
-                profile = _floor(config, ping, ranges, rng, stamp, side, namespace)
+                profile = _floor(config, ping, ranges, rng, side)
             else:
-                profile = _floor_below(config, ship, since_start, ranges, rng, side, namespace)
-            facets = None
-            if config.object != 'none' and ship is None:
-                facets = facets_of(config, ranges, snr(config, ranges))
-                profile = _with_object(config, profile, facets)
-            elif config.object != 'none' and ship is not None:
-                look = _look(config, ship, since_start, ranges, side)
+                look = look_of(config, ship, since_start, ranges, side)
+                roughness = _roughness(config, len(ranges), rng)
+                profile = floor_below(config, look, _terrain(config, ship), roughness, ranges)
                 floor = above(look, ship.course, side, _level(config))
+            if config.object != 'none':
                 facets = facets_of(config, ranges, snr(config, ranges), floor)
-                profile = _with_object_below(config, profile, facets, look)
+                profile = _with_object(config, profile, facets, look)
+            profile = evolve(profile, stamp_ns=stamp, namespace=namespace)
             truth.append(profile)
             snapshot = hear(config, profile, rng, facets)
             received.append(Received(stamp + listening_ns, snapshot, namespace))
@@ -251,77 +251,61 @@ def simulate(config: BathymetryScenario, seed: int) -> Scene:
 
 
 def _floor(
-    config: BathymetryScenario,
-    ping: int,
-    ranges: FloatArray,
-    rng: Generator,
-    stamp_ns: int,
-    side: str,
-    namespace: str,
+    config: BathymetryScenario, ping: int, ranges: FloatArray, rng: Generator, side: str
 ) -> TrueProfile:
+    """The floor below a sonar that rests, of which `simulate` knows the stamp."""
     drift = ping * config.patch_drift
     patch = (ranges >= config.patch_start + drift) & (ranges < config.patch_end + drift)
     height = config.slope * (ranges - ranges[0]) + patch * _roughness(config, len(ranges), rng)
-    height += config.undulation_height * np.sin(
-        2.0 * np.pi * (ranges - ranges[0]) / config.undulation_length
-    )
+    waves = 2.0 * np.pi * (ranges - ranges[0]) / config.undulation_length
+    height += config.undulation_height * np.sin(waves)
     depth = config.sonar_height - height
     valid = np.abs(depth) <= ranges  # before that, the sound is still in the water column
     valid &= _lit(config, ranges)
-    outward = array.across_track(depth, ranges)
     return TrueProfile(
-        stamp_ns=stamp_ns,
+        stamp_ns=0,
         frame_id='sonar',
         range=ranges,
         height=height,
         angle=array.angle_of_depth(depth, ranges, math.radians(config.tilt_deg)),
         patch=patch,
         valid=valid,
-        xyz=np.column_stack(
-            [np.zeros(len(ranges)), outward if side == 'port' else -outward, -depth]
-        ),
-        namespace=namespace,
+        xyz=_at_rest(depth, ranges, side == 'port'),
     )
 
 
-def _with_object(config: BathymetryScenario, floor: TrueProfile, facets: Facets) -> TrueProfile:
-    """The truth of a level floor with an object on it."""
+def _at_rest(depth: FloatArray, ranges: FloatArray, to_port: bool) -> FloatArray:
+    """Places (n, 3) of echoes in the frame of a sonar that rests."""
+    outward = array.across_track(depth, ranges)
+    return np.column_stack([np.zeros(len(depth)), outward if to_port else -outward, -depth])
+
+
+def _with_object(
+    config: BathymetryScenario, floor: TrueProfile, facets: Facets, look: sounding.Looks | None
+) -> TrueProfile:
+    """The truth of a level floor with an object on it; look: of the array of a ship, else None."""
     number, height, second = second_of(*surfaces_of(facets, len(floor.range)))
-    valid = number > 0
-    depth = config.sonar_height - np.where(valid, height, 0.0)
-    outward = array.across_track(depth, floor.range)
-    left = outward if floor.xyz[-1, 1] > 0.0 else -outward
+    height = np.where(number > 0, height, 0.0)
+    if look is None:
+        depth = config.sonar_height - height
+        angle = array.angle_of_depth(depth, floor.range, math.radians(config.tilt_deg))
+        xyz = _at_rest(depth, floor.range, floor.xyz[-1, 1] > 0.0)
+    else:
+        height, second = _level(config) + height, _level(config) + second
+        rise = np.clip((look.position[:, 2] - height) / (floor.range * look.C), -1.0, 1.0)
+        sine = sine_from(look, rise)
+        place = look.position + floor.range[:, None] * sounding.direction(look, sine)
+        angle = np.arcsin(np.clip(sine, -1.0, 1.0))
+        xyz = np.column_stack([place[:, :2], height])
     return evolve(
         floor,
-        height=np.where(valid, height, 0.0),
-        angle=array.angle_of_depth(depth, floor.range, math.radians(config.tilt_deg)),
-        patch=np.zeros(len(depth), bool),
-        valid=valid,
-        xyz=np.column_stack([np.zeros(len(depth)), left, -depth]),
+        height=height,
+        angle=angle,
+        patch=np.zeros(len(height), bool),
+        valid=number > 0,
+        xyz=xyz,
         surfaces=number.astype(np.uint8),
         height_2=second,
-    )
-
-
-def _with_object_below(
-    config: BathymetryScenario, floor: TrueProfile, facets: Facets, look: sounding.Looks
-) -> TrueProfile:
-    """The truth of a level floor with an object on it below a ship."""
-    number, height, second = second_of(*surfaces_of(facets, len(floor.range)))
-    valid = number > 0
-    z = _level(config) + np.where(valid, height, 0.0)
-    sine = np.clip((look.position[:, 2] - z) / (floor.range * look.C), -1.0, 1.0)
-    sine = sine * np.cos(look.psi) - np.sqrt(1.0 - sine * sine) * np.sin(look.psi)
-    place = look.position + floor.range[:, None] * sounding.direction(look, sine)
-    return evolve(
-        floor,
-        height=z,
-        angle=np.arcsin(np.clip(sine, -1.0, 1.0)),
-        patch=np.zeros(len(z), bool),
-        valid=valid,
-        xyz=np.column_stack([place[:, :2], z]),
-        surfaces=number.astype(np.uint8),
-        height_2=_level(config) + second,
     )
 
 
@@ -330,30 +314,18 @@ def _level(config: BathymetryScenario) -> float:
     return config.water_level - config.sonar_depth - config.sonar_height
 
 
-def _axes(config: BathymetryScenario, side: str) -> sounding.ArrayAxes:
-    mount = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
-    return sounding.array_axes(side, math.radians(config.tilt_deg), mount)
-
-
-def _look(
+def look_of(
     config: BathymetryScenario, ship: Ship, sent: float, ranges: FloatArray, side: str
 ) -> sounding.Looks:
     """How the array of a ship looks at a ping sent at a time in s."""
+    mount = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
+    axes = sounding.array_axes(side, math.radians(config.tilt_deg), mount)
     received = ship.pose(sent + 2.0 * ranges / config.sound_speed)
-    lever = np.array(config.sonar_lever)
-    return sounding.looks(_axes(config, side), lever, ship.pose(np.array(sent)), received)
+    return sounding.looks(axes, np.array(config.sonar_lever), ship.pose(np.array(sent)), received)
 
 
-def _floor_below(
-    config: BathymetryScenario,
-    ship: Ship,
-    since_start: float,
-    ranges: FloatArray,
-    rng: Generator,
-    side: str,
-    namespace: str,
-) -> TrueProfile:
-    """The floor that one ping of a moving ship sees."""
+def _terrain(config: BathymetryScenario, ship: Ship) -> Terrain:
+    """The floor below a moving ship."""
 
     def rise(along: FloatArray, off: FloatArray) -> FloatArray:
         wave = np.sin(2.0 * np.pi * off / config.undulation_length)
@@ -362,39 +334,27 @@ def _floor_below(
     def rough(along: FloatArray, off: FloatArray) -> BoolArray:
         return in_outline(config, along, off, config.patch_start, config.patch_end)
 
-    terrain = Terrain(_level(config), ship.course, rise, rough)
-    roughness = _roughness(config, len(ranges), rng)
-    first = FIRST_STAMP_NS
-    return profile_below(
-        config, ship, terrain, roughness, first, since_start, ranges, side, namespace
-    )
+    return Terrain(_level(config), ship.course, rise, rough)
 
 
-def profile_below(
+def floor_below(
     config: BathymetryScenario,
-    ship: Ship,
+    look: sounding.Looks,
     terrain: Terrain,
     roughness: FloatArray,
-    first_ns: int,
-    since_start: float,
     ranges: FloatArray,
-    side: str,
-    namespace: str,
 ) -> TrueProfile:
-    """The terrain that a ping sees which is sent some seconds after `first_ns`."""
-    axes = _axes(config, side)
-    seen = see(config, ship, terrain, roughness, since_start, ranges, config.sound_speed, axes)
-    valid = seen.reached & _lit(config, ranges)
+    """The terrain that a ping of a ship sees, see `see`; without its stamp."""
+    seen = see(config, look, terrain, roughness, ranges, config.sound_speed)
     return TrueProfile(
-        stamp_ns=first_ns + round(since_start * 1e9),
+        stamp_ns=0,
         frame_id='map',
         range=ranges,
         height=seen.place[:, 2],
         angle=np.where(seen.reached, np.arcsin(np.clip(seen.sine, -1.0, 1.0)), np.nan),
         patch=seen.patch,
-        valid=valid,
+        valid=seen.reached & _lit(config, ranges),
         xyz=np.where(seen.reached[:, None], seen.place, np.nan),
-        namespace=namespace,
     )
 
 
@@ -422,9 +382,7 @@ def _roughness(config: BathymetryScenario, bins: int, rng: Generator) -> FloatAr
     if width > 0.0 and config.roughness_law == 'exponential':
         white = lasting(white, math.exp(-1.0 / width))
     elif width > 0.0:
-        smooth = gaussian_filter1d(white, width, mode='wrap')
-        kernel = gaussian_filter1d(np.eye(1, bins, bins // 2)[0], width, mode='wrap')
-        white = smooth / np.linalg.norm(kernel)
+        white = smoothed(white, width)
     return config.patch_std * white
 
 
@@ -463,8 +421,11 @@ def hear(
             y += strength[:, None] * _echo(config, np.nan_to_num(other), rng)
     spikes = rng.uniform(size=bins) < config.spike_probability
     if spikes.any():
-        power = (signal + config.noise_variance) * 10.0 ** (0.1 * config.spike_db) * spikes
+        power = (signal + config.noise_variance) * SPIKE_POWER * spikes
         y += np.sqrt(power)[:, None] * _circular(rng, bins, config.staves)
+    speed = config.sound_speed  # which makes the wavelength at the array
+    if config.sound_speed_profile:
+        speed = float(rays.profile_of(config.sound_speed_profile).at(config.sonar_depth))
     return Snapshot(
         stamp_ns=floor.stamp_ns,
         frame_id='sonar',
@@ -474,7 +435,7 @@ def hear(
         signal_variance=signal if config.state_signal else None,
         sound_speed=config.sound_speed,
         frequency=config.frequency,
-        element_spacing=config.spacing_wavelengths * _speed_at_array(config) / config.frequency,
+        element_spacing=config.spacing_wavelengths * speed / config.frequency,
         sample_rate=0.5 * config.sound_speed / config.bin_width,
     )
 
@@ -490,19 +451,10 @@ def _of_facets(
     return np.column_stack(parts).view(np.complex128)
 
 
-def _speed_at_array(config: BathymetryScenario) -> float:
-    """Sound speed that makes the wavelength at the array, m/s."""
-    if not config.sound_speed_profile:
-        return config.sound_speed
-    return float(rays.profile_of(config.sound_speed_profile).at(config.sonar_depth))
-
-
 def _echo(config: BathymetryScenario, sine: FloatArray, rng: Generator) -> ComplexArray:
-    """Plane waves (n, P) of unit power from direction sines (n,), less what differs from stave to
-    stave."""
-    vectors = array.steering(
-        sine, config.staves, config.spacing_wavelengths, conjugate=config.conjugate
-    )
+    """Plane waves (n, P) of unit power from direction sines (n,), less what staves differ in."""
+    shape = config.staves, config.spacing_wavelengths
+    vectors = array.steering(sine, *shape, conjugate=config.conjugate)
     share = config.decorrelation
     wave = vectors * _circular(rng, len(sine), 1)
     if not share > 0.0:

@@ -55,16 +55,16 @@ def crossing_paths(divers: int, times: FloatArray, rng: Generator) -> list[Float
     return paths[:divers]
 
 
-def sense_scan(config: Any, stamp_ns: int, present: FloatArray, rng: Generator) -> list[Fixes]:
-    """All fixes of one scan in no particular order: of divers at `present` (n, 3), and false ones
-    in the square; config: a `DiverScenario`."""
-    half, std = config.clutter_range, config.fix_std
-    seen = present[:, :2][rng.uniform(size=len(present)) < config.detection_probability]
-    false = rng.uniform(-half, half, (rng.poisson(config.clutter), 2))
+def sense_scan(scan: Any) -> list[Fixes]:
+    """All fixes of one scan, a `Scan` of the simulator, in no particular order: of the divers that
+    are there, and false ones in the square."""
+    rng, half, std = scan.rng, scan.config.clutter_range, scan.config.fix_std
+    seen = scan.seen()[:, :2]
+    false = rng.uniform(-half, half, (rng.poisson(scan.config.clutter), 2))
     points = rng.permutation(np.vstack([seen + std * rng.normal(size=seen.shape), false]))
     return [
         Fixes(
-            stamp_ns=stamp_ns,
+            stamp_ns=scan.stamp_ns,
             position=np.column_stack([points, np.zeros(len(points))]),
             covariance=np.tile(std**2 * np.eye(2), (len(points), 1, 1)),
             frame_id='map',
@@ -104,8 +104,7 @@ def instruments_of_places(config: Any) -> dict[str, Any]:
 
 
 def namespace_of(measurement: Any) -> str:
-    """A transponder's positions have a topic for each diver: their message has no room for the
-    number."""
+    """A topic for each diver with a transponder: their message has no room for the number."""
     return f'diver_{measurement.target_id}' if isinstance(measurement, RelativeFix) else ''
 
 
@@ -114,15 +113,13 @@ def vessel_at(stamp_ns: int) -> tuple[FloatArray, FloatArray]:
     seconds = (stamp_ns + _HALF_NS) % (2 * _HALF_NS) * 1e-9 - _HALF_NS * 1e-9
     angle = VESSEL_SPEED * seconds / RADIUS
     place = RADIUS * np.array([np.cos(angle), np.sin(angle), 0.0])
-    return place, np.array(
-        [0.05 * np.sin(seconds), 0.03 * np.sin(0.7 * seconds), angle + 0.5 * np.pi]
-    )
+    roll, pitch = 0.05 * np.sin(seconds), 0.03 * np.sin(0.7 * seconds)
+    return place, np.array([roll, pitch, angle + 0.5 * np.pi])
 
 
-def sense_from_vessel(
-    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: Generator
-) -> list[VesselPose | RelativeFix]:
+def sense_from_vessel(scan: Any) -> list[VesselPose | RelativeFix]:
     """The pose of the vessel a moment before the scan, and each diver that is heard."""
+    config, rng, stamp_ns = scan.config, scan.rng, scan.stamp_ns
     pose_ns = stamp_ns - BEFORE_NS
     place, attitude = vessel_at(pose_ns)
     std = np.radians([ATTITUDE_STD_DEG, ATTITUDE_STD_DEG, HEADING_STD_DEG])
@@ -138,10 +135,10 @@ def sense_from_vessel(
     ]
     place, attitude = vessel_at(stamp_ns)
     R = geometry.rotation(*attitude)
-    for number, diver in enumerate(present, start=1):
+    for number, diver in enumerate(scan.present, start=1):
         if rng.uniform() >= config.detection_probability:
             continue
-        seen = geometry.rotation(0.0, 0.0, errors.bearing) @ (R.T @ (diver - place) - LEVER)
+        seen = geometry.rotation(0.0, 0.0, scan.errors.bearing) @ (R.T @ (diver - place) - LEVER)
         bent = np.radians(config.bearing_std_deg) * rng.normal(size=3)
         distance = float(np.linalg.norm(seen))
         turned = seen + np.cross(bent, seen)
@@ -152,23 +149,21 @@ def sense_from_vessel(
     return measured
 
 
-def sense_geodetic(
-    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: Generator
-) -> list[GeodeticFix]:
+def sense_geodetic(scan: Any) -> list[GeodeticFix]:
     """Positions with a white error, in latitude and longitude."""
-    fixes = []
-    for diver in present:
-        if rng.uniform() >= config.detection_probability:
+    fixes, std = [], scan.config.fix_std
+    for diver in scan.present:
+        if scan.rng.uniform() >= scan.config.detection_probability:
             continue
-        where = diver + np.append(config.fix_std * rng.normal(size=2), 0.0)
+        where = diver + np.append(std * scan.rng.normal(size=2), 0.0)
         latitude, longitude, height = ORIGIN.geodetic(where).tolist()
         fixes.append(
             GeodeticFix(
-                stamp_ns=stamp_ns,
+                stamp_ns=scan.stamp_ns,
                 latitude=latitude,
                 longitude=longitude,
                 height=height,
-                covariance=np.diag([config.fix_std**2, config.fix_std**2, 1.0]),
+                covariance=np.diag([std**2, std**2, 1.0]),
                 frame_id='gps',
             )
         )

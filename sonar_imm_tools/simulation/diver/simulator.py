@@ -11,13 +11,14 @@
 A scenario (`SCENARIOS`) is a named choice of `motion`, how the divers move, and `sensor`, how they
 are observed. The paper's Table 1 gives start, speed, sampling and accuracy, but not the path. In
 `table1` the diver swims legs of 7 to 15 s whose headings lie within 85 degrees of a general
-heading ("zigzag with general consistent direction" in the paper).
+heading ("zigzag with general consistent direction" in the paper). In one
+file, since all of it draws from one generator in turn.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 from attrs import evolve, frozen
 import numpy as np
@@ -48,6 +49,8 @@ SENSORS = ('polar', 'positions', 'multistatic_fixes', 'arrivals', 'scans', 'geod
 TRANSMITTER = np.array([0.0, 0.0, 0.0])
 RECEIVERS = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
 """One transmitter that also listens, and three receivers, metres."""
+LATE_DELAY = 3.0
+"""Seconds, the largest delay of a scan that is received late."""
 
 
 @frozen(kw_only=True)
@@ -122,8 +125,6 @@ class DiverScenario(Scenario):
     clutter_range: float = parameter(100.0, 'm',
         'half width of the square in which false detections fall', range=(1.0, None))
     late_fraction: float = parameter(0.0, '', 'share of scans received late', range=(0.0, 1.0))
-    late_delay: float = parameter(3.0, 's',
-        'largest delay of a scan that is received late', range=(0.0, None))
     # fmt: on
 
     def check(self) -> list[str]:
@@ -194,7 +195,6 @@ SCENARIOS: Scenarios = {
         {'sensor': 'geodetic', 'speed': 0.75, 'random_rotation': True}),
 }
 # fmt: on
-"""Name: (what it is, what differs from the defaults of `DiverScenario`)."""
 
 scenario = DiverScenario.among(SCENARIOS)
 
@@ -202,7 +202,9 @@ scenario = DiverScenario.among(SCENARIOS)
 def simulate(config: DiverScenario, seed: int) -> Scene:
     """Run a scene. The same config and seed give the same scene."""
     rng = np.random.default_rng(seed)
-    times = _scan_times(config, rng)
+    times = np.arange(0.0, config.duration + 0.5 * config.step, config.step)
+    jitter = 0.5 * config.step_jitter * config.step
+    times[1:] += rng.uniform(-jitter, jitter, len(times) - 1)
     stamps = stamps_of(times)
     turn = rng.uniform(0.0, 2.0 * np.pi) if config.random_rotation else 0.0
     if config.motion == 'crossing':
@@ -217,18 +219,12 @@ def simulate(config: DiverScenario, seed: int) -> Scene:
     received = []
     for k, stamp in enumerate(stamps):
         present = np.array([track.position[k] for track in truth])
-        when = int(stamp) + delay_ns(config, rng)
-        for measurement in SENSE[config.sensor](config, errors.at(k), int(stamp), present, rng):
+        when = int(stamp) + delay_ns(config, LATE_DELAY, rng)
+        scan = Scan(config, errors.at(k), int(stamp), present, rng)
+        for measurement in SENSE[config.sensor](scan):
             received.append(Received(when, measurement, namespace_of(measurement)))
     received.sort(key=lambda item: item.received_ns)
     return Scene(tuple(received), truth)
-
-
-def _scan_times(config: DiverScenario, rng: Generator) -> FloatArray:
-    times = np.arange(0.0, config.duration + 0.5 * config.step, config.step)
-    jitter = 0.5 * config.step_jitter * config.step
-    times[1:] += rng.uniform(-jitter, jitter, len(times) - 1)
-    return times
 
 
 def _path(
@@ -240,28 +236,17 @@ def _path(
     velocity = _velocity(config, times, general, rng)
     state = np.empty((len(times), 4))
     turned = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    start = turned @ (np.array(config.start) + config.spacing * _spiral(diver))
+    # The first one at the centre of a spiral.
+    spiral = np.sqrt(diver) * np.array([np.cos(2.4 * diver), np.sin(2.4 * diver)])
+    start = turned @ (np.array(config.start) + config.spacing * spiral)
     moved = np.cumsum(velocity[1:] * np.diff(times)[:, None], axis=0)
     state[:, :2] = start + np.vstack([np.zeros(2), moved])
     state[:, 2:] = velocity
     return state
 
 
-def _spiral(diver: int) -> FloatArray:
-    """Where diver number `diver` starts, in units of the spacing: the first at the centre."""
-    return np.sqrt(diver) * np.array([np.cos(2.4 * diver), np.sin(2.4 * diver)])
-
-
 def _along(heading: FloatArray, speed: FloatArray | float) -> FloatArray:
     return np.column_stack([np.cos(heading), np.sin(heading)]) * np.reshape(speed, (-1, 1))
-
-
-def _leg_numbers(config: DiverScenario, times: FloatArray, rng: Generator) -> np.ndarray:
-    """Which leg (n,) each time falls in."""
-    ends = np.cumsum(
-        rng.uniform(config.leg_min, config.leg_max, int(config.duration / config.leg_min) + 2)
-    )
-    return np.searchsorted(ends, times)
 
 
 def _velocity(
@@ -275,15 +260,13 @@ def _velocity(
         return _along(np.full(len(times), general), config.speed)
     if motion == 'circle':
         return _along(general + 2.0 * np.pi * times / 80.0, config.speed)
-    leg = _leg_numbers(config, times, rng)
+    count = int(config.duration / config.leg_min) + 2
+    leg = np.searchsorted(np.cumsum(rng.uniform(config.leg_min, config.leg_max, count)), times)
     if motion == 'zigzag':
         return _along(general + np.where(leg % 2, -1.0, 1.0) * turn, config.speed)
     heading = (general + rng.uniform(-turn, turn, leg[-1] + 1))[leg]
     rests = (leg % 3 == 2) & (motion == 'stop_and_go')
     return _along(heading, np.where(rests, 0.0, config.speed))
-
-
-# -- what sensors make of it ----------------------------------------------------------------------
 
 
 @frozen(eq=False)
@@ -301,6 +284,21 @@ class Errors:
     def at(self, k: int) -> Errors:
         """Those of time k: fix_bias (2,)."""
         return evolve(self, fix_bias=self.fix_bias[k])
+
+
+class Scan(NamedTuple):
+    """What a sensor is to see: the divers `present` (n, 3) at a stamp."""
+
+    config: DiverScenario
+    errors: Errors
+    stamp_ns: int
+    present: FloatArray
+    rng: Generator
+
+    def seen(self) -> FloatArray:
+        """Places (m, 3) of those divers that are detected."""
+        chance = self.rng.uniform(size=len(self.present))
+        return self.present[chance < self.config.detection_probability]
 
 
 def draw_errors(config: DiverScenario, times: FloatArray, rng: Generator) -> Errors:
@@ -323,11 +321,10 @@ def draw_errors(config: DiverScenario, times: FloatArray, rng: Generator) -> Err
     return Errors(height, misplaced, clock, float(sound_speed), float(bearing), bias)
 
 
-def _sense_polar(
-    config: DiverScenario, errors: Errors, stamp_ns: int, present: FloatArray, rng: Generator
-) -> list[Fix]:
+def _sense_polar(scan: Scan) -> list[Fix]:
     """Range and bearing from the origin, converted without bias; clutter uniform in the square."""
-    seen = present[:, :2][rng.uniform(size=len(present)) < config.detection_probability]
+    config, rng = scan.config, scan.rng
+    seen = scan.seen()[:, :2]
     outlier = rng.uniform(size=len(seen)) < config.outlier_probability
     false = rng.poisson(config.clutter)
     half = config.clutter_range
@@ -340,25 +337,24 @@ def _sense_polar(
     bearing_std = np.deg2rad(config.bearing_std_deg)
     ranges = np.hypot(*points.T) + config.range_std * rng.normal(size=len(points))
     bearings = np.arctan2(points[:, 1], points[:, 0]) + bearing_std * rng.normal(size=len(points))
-    bearings += errors.bearing
+    bearings += scan.errors.bearing
     z, R = unbiased_polar_to_cartesian(ranges, bearings, config.range_std**2, bearing_std**2)
-    return [_fix(stamp_ns, place, covariance) for place, covariance in zip(z, R)]
+    return [_fix(scan, place, covariance) for place, covariance in zip(z, R)]
 
 
-def _fix(stamp_ns: int, place: FloatArray, covariance: FloatArray, height: float = 0.0) -> Fix:
+def _fix(scan: Scan, place: FloatArray, covariance: FloatArray, height: float = 0.0) -> Fix:
     position = np.append(place, height)
-    return Fix(stamp_ns=stamp_ns, position=position, covariance=covariance, frame_id='map')
+    return Fix(stamp_ns=scan.stamp_ns, position=position, covariance=covariance, frame_id='map')
 
 
-def _sense_arrivals(
-    config: DiverScenario, errors: Errors, stamp_ns: int, present: FloatArray, rng: Generator
-) -> list[Arrivals]:
-    """Echoes of one ping at every receiver."""
+def _sense_arrivals(scan: Scan) -> list[Arrivals]:
+    config, errors, present = scan.config, scan.errors, scan.present
     receivers = RECEIVERS - np.outer(config.receiver_depths, [0.0, 0.0, 1.0])
+    tx = receivers[0]
     pairs = [
         (receiver, path)
         for receiver, rx in enumerate(receivers)
-        for path in _paths(config, rx, errors.misplaced[receiver], present, rng)
+        for path in _paths(scan, tx, rx, errors.misplaced[receiver])
     ]
     if not pairs:
         return []
@@ -369,13 +365,13 @@ def _sense_arrivals(
     nothing = np.full(n, np.nan)
     depth = nothing
     if config.depth_std and len(present) == 1:
-        depth = np.full(n, -present[0, 2] + config.depth_std * rng.normal())
+        depth = np.full(n, -present[0, 2] + config.depth_std * scan.rng.normal())
     return [
         Arrivals(
-            stamp_ns=stamp_ns,
+            stamp_ns=scan.stamp_ns,
             tx_id=np.zeros(n),
             rx_id=receiver,
-            tx=np.tile(_transmitter(config), (n, 1)),
+            tx=np.tile(tx, (n, 1)),
             rx=receivers[receiver],
             toa=toa,
             var_toa=np.full(n, config.toa_std**2),
@@ -388,20 +384,10 @@ def _sense_arrivals(
     ]
 
 
-def _transmitter(config: DiverScenario) -> FloatArray:
-    return TRANSMITTER - np.array([0.0, 0.0, config.receiver_depths[0]])
-
-
-def _paths(
-    config: DiverScenario,
-    rx: FloatArray,
-    misplaced: FloatArray,
-    present: FloatArray,
-    rng: Generator,
-) -> FloatArray:
+def _paths(scan: Scan, tx: FloatArray, rx: FloatArray, misplaced: FloatArray) -> FloatArray:
     """Path lengths heard at one receiver, said to be at `rx` (3,) but `misplaced` (2,), metres:
     divers, some of them late by a reflection, and clutter."""
-    tx = _transmitter(config)
+    config, present, rng = scan.config, scan.present, scan.rng
     there = rx + np.append(misplaced, 0.0)
     path = np.linalg.norm(present - tx, axis=1) + np.linalg.norm(present - there, axis=1)
     path = path[rng.uniform(size=len(path)) < config.detection_probability]
@@ -413,32 +399,26 @@ def _paths(
     return np.concatenate([path, false])
 
 
-def _sense_positions(
-    config: DiverScenario, errors: Errors, stamp_ns: int, present: FloatArray, rng: Generator
-) -> list[Fix]:
+def _sense_positions(scan: Scan) -> list[Fix]:
     """Positions with a white and a lasting error; the covariance states the white one."""
-    seen = present[rng.uniform(size=len(present)) < config.detection_probability]
-    places = seen[:, :2] + errors.fix_bias + config.fix_std * rng.normal(size=(len(seen), 2))
+    config, rng, seen = scan.config, scan.rng, scan.seen()
+    places = seen[:, :2] + scan.errors.fix_bias + config.fix_std * rng.normal(size=(len(seen), 2))
     heights, variances = np.zeros(len(seen)), [config.fix_std**2] * 2
     if config.fix_height_std:
         heights = seen[:, 2] + config.fix_height_std * rng.normal(size=len(seen))
         variances.append(config.fix_height_std**2)
     white = np.diag(variances)
-    return [_fix(stamp_ns, place, white, height) for place, height in zip(places, heights)]
+    return [_fix(scan, place, white, height) for place, height in zip(places, heights)]
 
 
-def _sense_multistatic_fixes(
-    config: DiverScenario, errors: Errors, stamp_ns: int, present: FloatArray, rng: Generator
-) -> list[Fix]:
+def _sense_multistatic_fixes(scan: Scan) -> list[Fix]:
     """One fix per ping and diver, from its own echoes; none where the geometry gives none."""
-    fixes = []
-    for position in present:
-        for ping in _sense_arrivals(config, errors, stamp_ns, position[None], rng):
-            fix = localise(
-                ping.rx, ping.toa, ping.var_toa, tx=ping.tx, sound_speed=config.sound_speed
-            )
+    fixes, speed = [], scan.config.sound_speed
+    for position in scan.present:
+        for ping in _sense_arrivals(scan._replace(present=position[None])):
+            fix = localise(ping.rx, ping.toa, ping.var_toa, tx=ping.tx, sound_speed=speed)
             if isinstance(fix, Localisation):
-                fixes.append(_fix(stamp_ns, fix.position, fix.covariance))
+                fixes.append(_fix(scan, fix.position, fix.covariance))
     return fixes
 
 
@@ -449,5 +429,5 @@ SENSE: dict[str, Callable[..., Iterable[Any]]] = {
     'multistatic_fixes': _sense_multistatic_fixes,
     'geodetic': sense_geodetic,
     'usbl': sense_from_vessel,
-    'scans': lambda config, errors, *rest: sense_scan(config, *rest),
+    'scans': sense_scan,
 }

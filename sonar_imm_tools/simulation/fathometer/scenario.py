@@ -20,10 +20,9 @@ from typing import Any
 from attrs import frozen
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from sonar_imm.acoustics.fathometer import PROCESSORS
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.parameters import parameter
 from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm.truth import PRESENT
@@ -40,14 +39,9 @@ class FathometerScenario(Scenario):
     """Parameters of a fathometer scene; the defaults are like the drift of the paper."""
 
     INSTRUMENT = (
-        'record_seconds',
-        'snapshot_seconds',
-        'frequency_min',
-        'frequency_max',
-        'phones',
-        'element_spacing',
-        'sound_speed',
-    )
+        'record_seconds', 'snapshot_seconds', 'frequency_min', 'frequency_max', 'phones',
+        'element_spacing', 'sound_speed',
+    )  # fmt: skip
 
     # fmt: off
     level: str = parameter('response', '', 'kind of records that is written', choices=LEVELS)
@@ -147,9 +141,11 @@ class FathometerScenario(Scenario):
             problems.append('frequency_max cannot exceed half the sample_rate')
         if self.level == 'pressure' and self.records * self.record_seconds > 600.0:
             problems.append('pressure is made for 600 s at the most: fewer or shorter records')
-        if self.level == 'csdm' and self.spectra_bytes() > MOST_MEMORY:
+        rows = (self.frequency_max - self.frequency_min) * self.snapshot_seconds
+        size = 8.0 * self.records * rows * self.phones**2
+        if self.level == 'csdm' and size > MOST_MEMORY:
             problems.append(
-                f'these cross-spectra would take {1e-9 * self.spectra_bytes():.1f} GB: '
+                f'these cross-spectra would take {1e-9 * size:.1f} GB: '
                 'make fewer records, or traces of them (level response)'
             )
         if self.ship_pass and len(self.ship_pass) != 2:
@@ -174,11 +170,6 @@ class FathometerScenario(Scenario):
             known |= envelope_parameters(self.pulse_width, self.noise_sigma)
         # The speed of a scene is the one that it has.
         return {**known, 'sound_speed_std': 0.0}
-
-    def spectra_bytes(self) -> float:
-        """Size of all cross-spectra of the scene."""
-        rows = (self.frequency_max - self.frequency_min) * self.snapshot_seconds
-        return 8.0 * self.records * rows * self.phones**2
 
 
 # fmt: off
@@ -211,7 +202,6 @@ SCENARIOS: Scenarios = {
          'fading': ()}),
 }
 # fmt: on
-"""Name: (what it is, what differs from the defaults of `FathometerScenario`)."""
 
 scenario = FathometerScenario.among(SCENARIOS)
 
@@ -224,7 +214,7 @@ class Drift:
 
     depth: FloatArray
     amplitude: FloatArray
-    present: NDArray[np.bool_]
+    present: BoolArray
     array_depth: FloatArray
     array_depth_stated: FloatArray
 

@@ -25,7 +25,7 @@ too shallow, make them weaker and leave peaks beside them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,14 +43,9 @@ from ..scenario import FIRST_STAMP_NS
 from .scenario import Drift, drift_of, FathometerScenario, scenario, SCENARIOS
 
 __all__ = [
-    'cross_spectra',
-    'FathometerScenario',
-    'pressure_blocks',
-    'scenario',
-    'SCENARIOS',
-    'simulate',
+    'cross_spectra', 'FathometerScenario', 'pressure_blocks', 'scenario', 'SCENARIOS', 'simulate',
     'stream',
-]
+]  # fmt: skip
 
 _THRESHOLD = 3.0
 """Standard deviations of the noise below which a profiler writes zero."""
@@ -74,22 +69,18 @@ def stream(
     """Like `simulate`, record by record: long scenes of cross-spectra do not fit into memory."""
     rng = np.random.default_rng(seed)
     drift = drift_of(config, rng)
-    for record, measurements in enumerate(_measurements(config, drift, rng)):
+    for record in range(config.records):
+        depth = float(drift.array_depth_stated[record])
+        stated = None if config.depth_companion else depth
+        measurements = _measurements(config, drift, record, stated, rng)
         stamp_ns = measurements[-1].stamp_ns
         received = [Received(item.stamp_ns, item) for item in measurements]
         if config.depth_companion:
-            depth = float(drift.array_depth_stated[record])
             companion = ArrayDepth(stamp_ns=stamp_ns, depth=depth, frame_id=FRAME_ID)
             received.insert(0, Received(stamp_ns, companion))
         here = np.flatnonzero(drift.present[record])
-        truth = TrueReflectors(
-            stamp_ns,
-            FRAME_ID,
-            (1 + here).astype(np.uint32),
-            drift.depth[record, here],
-            drift.amplitude[record, here],
-        )
-        yield received, truth
+        shown = drift.depth[record, here], drift.amplitude[record, here]
+        yield received, TrueReflectors(stamp_ns, FRAME_ID, (1 + here).astype(np.uint32), *shown)
 
 
 def stamp_of(config: FathometerScenario, record: int) -> int:
@@ -97,26 +88,24 @@ def stamp_of(config: FathometerScenario, record: int) -> int:
     return FIRST_STAMP_NS + round((record + 1) * config.record_seconds * 1e9)
 
 
-def _measurements(config: FathometerScenario, drift: Drift, rng: Generator) -> Iterator[list[Any]]:
-    """The measurements of each record."""
-    for record in range(config.records):
-        stated = None if config.depth_companion else float(drift.array_depth_stated[record])
-        if config.level == 'pressure':
-            yield pressure_blocks(config, drift, record, stated, rng)
-        elif config.level == 'csdm':
-            yield [cross_spectra(config, drift, record, stated, rng)]
-        else:
-            amplitude, sigma = _TRACES[config.level](config, drift, record, rng)
-            yield [
-                Trace(
-                    stamp_ns=stamp_of(config, record),
-                    frame_id=FRAME_ID,
-                    depth=_depths(config),
-                    amplitude=amplitude,
-                    sigma=None if sigma is None else np.full(len(amplitude), sigma),
-                    reference_depth=stated,
-                )
-            ]
+def _measurements(
+    config: FathometerScenario, drift: Drift, record: int, stated: float | None, rng: Generator
+) -> Sequence[Any]:
+    """The measurements of a record, which state a depth of the array."""
+    if config.level == 'pressure':
+        return pressure_blocks(config, drift, record, stated, rng)
+    if config.level == 'csdm':
+        return [cross_spectra(config, drift, record, stated, rng)]
+    amplitude, sigma = _TRACES[config.level](config, drift, record, rng)
+    trace = Trace(
+        stamp_ns=stamp_of(config, record),
+        frame_id=FRAME_ID,
+        depth=_depths(config),
+        amplitude=amplitude,
+        sigma=None if sigma is None else np.full(len(amplitude), sigma),
+        reference_depth=stated,
+    )
+    return [trace]
 
 
 def cross_spectra(
@@ -178,9 +167,8 @@ def _pulses(
     shift = drift.array_depth_stated[record] - drift.array_depth[record]
     # The level of an MVDR response falls with the two-way path plus the length of the array.
     height = drift.depth[record] - drift.array_depth[record]
-    level = (
-        12.0 * drift.amplitude[record] / (2.0 * height + config.phones * config.element_spacing)
-    )
+    length = config.phones * config.element_spacing
+    level = 12.0 * drift.amplitude[record] / (2.0 * height + length)
     there = pulse(depth[:, None] - drift.depth[record] - shift) @ level
     return there + noise, config.noise_sigma
 

@@ -34,13 +34,15 @@ from sonar_imm.measurements import SonarImage
 from sonar_imm.truth import Received
 
 from ..scenario import delay_ns
-from .scenario import ObstacleScenario
+from .scenario import LATE_DELAY, ObstacleScenario, PULSE_LENGTH
 
 _TEXTURE = 256
 """Patches of the sea floor along each axis before they repeat."""
 _GLINTS = {'point': 1, 'chain': 60, 'float': 10, 'wreck': 80}
 _HULL = np.array([[0.5, 0.0], [0.2, 0.12], [-0.5, 0.12], [-0.5, -0.12], [0.2, -0.12], [0.5, 0.0]])
 """Corners of the outline of a wreck, along it and across, in lengths: bow ahead, stern flat."""
+SEABED_POWER = 10.0
+"""Mean power of the sea floor where the edge of the beam meets it, over the noise."""
 _FAR_SIDELOBES = 6.0
 """Sidelobes farther than this many beam widths from the beam are left out of speckle."""
 
@@ -63,7 +65,7 @@ class ImageSonar:
         self._beam = _BeamPattern(np.radians(config.beam_width_deg), config.sidelobe_db)
         reach = int(np.ceil(_FAR_SIDELOBES * np.radians(config.beam_width_deg) / beam_step))
         self._across = _unit(self._beam(beam_step * np.arange(-reach, reach + 1)))
-        reach = int(np.ceil(2.0 * config.pulse_length / step))
+        reach = int(np.ceil(2.0 * PULSE_LENGTH / step))
         self._along = _unit(self._pulse(step * np.arange(-reach, reach + 1, dtype=np.float64)))
         shape = config.seabed_shape
         self._texture = rng.gamma(shape, 1.0 / shape, (_TEXTURE, _TEXTURE))
@@ -107,7 +109,7 @@ class ImageSonar:
         down = np.full_like(north, below)
         seen = np.stack([north, east, down], axis=-1) @ sonar.R
         onset = below / np.sin(np.radians(0.5 * config.vertical_fov_deg))
-        power = 10.0 ** (0.1 * config.seabed_power_db) * 4.0 * np.square(onset / r)
+        power = SEABED_POWER * 4.0 * np.square(onset / r)
         power = power * self._vertical(seen) * there
         patch = np.stack([sonar.position[0] + north, sonar.position[1] + east])
         i, j = np.floor(patch / config.seabed_patch).astype(int) % _TEXTURE
@@ -158,7 +160,7 @@ class ImageSonar:
 
     def _share_of_a_beam(self, distance: float) -> float:
         """Share of the glints of a line that fall into one beam and pulse, one at least."""
-        inside = max(distance * np.radians(self.config.beam_width_deg), self.config.pulse_length)
+        inside = max(distance * np.radians(self.config.beam_width_deg), PULSE_LENGTH)
         length = max(self.config.target_size, 1e-9)
         if self.config.target == 'wreck':
             length *= np.linalg.norm(np.diff(_HULL, axis=0), axis=1).sum()
@@ -167,7 +169,7 @@ class ImageSonar:
 
     def _pulse(self, off: FloatArray) -> FloatArray:
         """Amplitude of the envelope `off` metres beside the echo."""
-        return np.exp(-2.0 * np.log(2.0) * np.square(off / self.config.pulse_length))
+        return np.exp(-2.0 * np.log(2.0) * np.square(off / PULSE_LENGTH))
 
     def _vertical(self, body: FloatArray) -> FloatArray:
         """Power, out and back, of what lies at `body` (..., 3) FRD; 1/4 at the edge."""
@@ -192,7 +194,7 @@ def image_pings(
     for k, stamp in enumerate(stamps):
         pose = Pose(poses.position[k], poses.R[k])
         pixels = sonar.image(pose, [place[k] for place in places], stretch)
-        late = delay_ns(config, rng)
+        late = delay_ns(config, LATE_DELAY, rng)
         if rng.uniform() < config.ping_loss:
             continue
         image = SonarImage(
@@ -207,8 +209,7 @@ def image_pings(
 
 
 def vertical_pattern(elevation: FloatArray, width: float) -> FloatArray:
-    """Power received from `elevation` rad, out and back, by a beam `width` rad high (-3 dB, one
-    way); Gaussian."""
+    """Power from `elevation` rad, out and back, in a Gaussian beam `width` rad high (-3 dB)."""
     return np.exp(-8.0 * np.log(2.0) * np.square(elevation / width))
 
 

@@ -19,74 +19,20 @@ from sonar_imm.parameters import parameter
 
 from ..scenario import Scenario, Scenarios
 
-TARGETS = ('point', 'chain', 'float', 'wreck')
-FADINGS = ('steady', 'rayleigh')
-
-
-@frozen(kw_only=True, slots=False)
-class ImageScenario(Scenario):
-    """What images show besides where obstacles are; the defaults are those of a Blueview P450 that
-    looks at moored spheres."""
-
-    # fmt: off
-    images: bool = parameter(False, '',
-        'whether the sonar sends images, in which a detector has to find the obstacles')
-    image_beams: int = parameter(256, '', 'number of beams of an image', range=(2, 4096))
-    image_bins: int = parameter(600, '', 'number of ranges of an image', range=(2, 10_000))
-    image_gain: float = parameter(4.0, '',
-        'counts of an image for the amplitude of the noise; images hold 0 to 255',
-        range=(0.01, 255.0))
-    beam_width_deg: float = parameter(1.0, 'deg',
-        '-3 dB width of a beam, of the power received', range=(0.01, 30.0))
-    sidelobe_db: float = parameter(20.0, 'dB',
-        'level of the sidelobes of a beam below its maximum', range=(14.0, 80.0))
-    pulse_length: float = parameter(0.3, 'm',
-        '-3 dB width of the echo of a point in range', range=(0.001, 10.0))
-    target: str = parameter('point', '',
-        'what obstacles are: a point, a chain of 60 glints along a level line, a float of 10 '
-        'glints, or the outline of a wreck of 80 glints', choices=TARGETS)
-    target_size: float = parameter(6.0, 'm',
-        'length of a chain or wreck, or diameter of a float', range=(0.0, 100.0))
-    target_snr_db: float = parameter(18.0, 'dB',
-        'peak power of an echo on the axis of the sonar over the mean power around it',
-        range=(-20.0, 80.0))
-    target_fading: str = parameter('steady', '',
-        'target point: whether the echo is as strong in every ping (steady) or fades (rayleigh); '
-        'glints always fade', choices=FADINGS)
-    reverberation: float = parameter(30.0, '',
-        'power scattered back by the water at 10 m, relative to the noise; falls with the square '
-        'of the range', range=(0.0, 1e6))
-    seabed_power_db: float = parameter(10.0, 'dB',
-        'mean power of the sea floor where the edge of the beam meets it, relative to the noise',
-        range=(-100.0, 60.0))
-    seabed_shape: float = parameter(4.0, '',
-        'shape of the gamma distribution of the power of the patches of the sea floor: the '
-        'smaller, the rougher', range=(0.1, 1000.0))
-    seabed_patch: float = parameter(1.0, 'm',
-        'side of a patch of the sea floor', range=(0.01, 1000.0))
-    # fmt: on
-
-    def feeder_instruments(self) -> dict[str, Any]:
-        """What `fls_detector_node` has to know of the images. The scene that is built on this
-        class has the range and the sector."""
-        if not self.images:
-            return {}
-        return {
-            'image_near_range': 0.0,
-            'image_far_range': self.max_range,  # type: ignore[attr-defined]
-            'image_fov_deg': self.horizontal_fov_deg,  # type: ignore[attr-defined]
-            'beam_width_deg': self.beam_width_deg,
-            'range_resolution': self.pulse_length,
-        }
-
-
 PLACEMENTS = ('offset', 'tether', 'seabed', 'surface')
 MOTIONS = ('fixed', 'swaying', 'swinging', 'moving')
+TARGETS = ('point', 'chain', 'float', 'wreck')
+FADINGS = ('steady', 'rayleigh')
+LATE_DELAY = 2.0
+"""Seconds, the largest delay of a ping that is received late."""
+PULSE_LENGTH = 0.3
+"""-3 dB width of the echo of a point in range, m."""
 
 
 @frozen(kw_only=True)
-class ObstacleScenario(ImageScenario):
-    """Parameters of an obstacle scene; the defaults are the first case of docs/obstacle.md."""
+class ObstacleScenario(Scenario):
+    """Parameters of an obstacle scene; the defaults are the first case of docs/obstacle.md, and
+    images like those of a Blueview P450 that looks at moored spheres."""
 
     INSTRUMENT = (
         'sonar_lever', 'sonar_mount_rpy_deg', 'azimuth_model', 'ping_timing', 'max_range',
@@ -106,14 +52,10 @@ class ObstacleScenario(ImageScenario):
     dive: float = parameter(0.0, 'm',
         'amplitude with which the vehicle goes up and down once per minute', range=(0.0, 100.0))
     roll_rms_deg: float = parameter(1.5, 'deg', 'rms roll of the vehicle', range=(0.0, 30.0))
-    roll_period: float = parameter(6.0, 's', 'period of the roll', range=(0.5, 600.0))
     pitch_rms_deg: float = parameter(1.0, 'deg', 'rms pitch of the vehicle', range=(0.0, 30.0))
-    pitch_period: float = parameter(8.0, 's', 'period of the pitch', range=(0.5, 600.0))
     yaw_rms_deg: float = parameter(1.5, 'deg',
         'rms yaw of the vehicle about its course', range=(0.0, 30.0))
-    yaw_period: float = parameter(11.0, 's', 'period of the yaw', range=(0.5, 600.0))
     heave_rms: float = parameter(0.21, 'm', 'rms heave of the vehicle', range=(0.0, 20.0))
-    heave_period: float = parameter(20.0, 's', 'period of the heave', range=(0.5, 600.0))
     sway_rms: float = parameter(0.14, 'm',
         'rms sway of the vehicle across its course', range=(0.0, 20.0))
     sway_period: float = parameter(20.0, 's', 'period of the sway', range=(0.5, 600.0))
@@ -187,15 +129,9 @@ class ObstacleScenario(ImageScenario):
     outlier_probability: float = parameter(0.0, '',
         'probability that an echo of an obstacle is an outlier, which comes from elsewhere',
         range=(0.0, 1.0))
-    outlier_range: float = parameter(8.0, 'm',
-        'largest error in range of an outlier', range=(0.0, 100.0))
-    outlier_bearing_deg: float = parameter(6.0, 'deg',
-        'largest error in bearing of an outlier', range=(0.0, 90.0))
     clutter: float = parameter(0.0, '',
         'mean number of false detections in a ping', range=(0.0, 1000.0))
     late_fraction: float = parameter(0.0, '', 'share of pings received late', range=(0.0, 1.0))
-    late_delay: float = parameter(2.0, 's',
-        'largest delay of a ping that is received late', range=(0.0, 600.0))
 
     # -- obstacles -------------------------------------------------------------------------------
     placement: str = parameter('offset', '',
@@ -227,20 +163,65 @@ class ObstacleScenario(ImageScenario):
         range=(0.0, 100.0))
     obstacle_sway_time: float = parameter(20.0, 's',
         'motion swaying: time over which the position is correlated', range=(0.1, 3600.0))
-    obstacle_swing_period: float = parameter(15.0, 's',
-        'motion swinging: period of the waves', range=(0.5, 3600.0))
+
     obstacle_speed: tuple[float, ...] = parameter((0.3, 1.5), 'm/s',
         'motion moving: least and greatest speed', range=(0.0, 20.0))
     obstacle_starts: float = parameter(-1e9, 's',
         'motion moving: time after the first ping at which obstacles start to move')
     obstacle_stops: float = parameter(1e9, 's',
         'motion moving: time after the first ping at which obstacles stop')
+
+    # -- images ----------------------------------------------------------------------------------
+    images: bool = parameter(False, '',
+        'whether the sonar sends images, in which a detector has to find the obstacles')
+    image_beams: int = parameter(256, '', 'number of beams of an image', range=(2, 4096))
+    image_bins: int = parameter(600, '', 'number of ranges of an image', range=(2, 10_000))
+    image_gain: float = parameter(4.0, '',
+        'counts of an image for the amplitude of the noise; images hold 0 to 255',
+        range=(0.01, 255.0))
+    beam_width_deg: float = parameter(1.0, 'deg',
+        '-3 dB width of a beam, of the power received', range=(0.01, 30.0))
+    sidelobe_db: float = parameter(20.0, 'dB',
+        'level of the sidelobes of a beam below its maximum', range=(14.0, 80.0))
+    target: str = parameter('point', '',
+        'what obstacles are: a point, a chain of 60 glints along a level line, a float of 10 '
+        'glints, or the outline of a wreck of 80 glints', choices=TARGETS)
+    target_size: float = parameter(6.0, 'm',
+        'length of a chain or wreck, or diameter of a float', range=(0.0, 100.0))
+    target_snr_db: float = parameter(18.0, 'dB',
+        'peak power of an echo on the axis of the sonar over the mean power around it',
+        range=(-20.0, 80.0))
+    target_fading: str = parameter('steady', '',
+        'target point: whether the echo is as strong in every ping (steady) or fades (rayleigh); '
+        'glints always fade', choices=FADINGS)
+    reverberation: float = parameter(30.0, '',
+        'power scattered back by the water at 10 m, relative to the noise; falls with the square '
+        'of the range', range=(0.0, 1e6))
+    seabed_shape: float = parameter(4.0, '',
+        'shape of the gamma distribution of the power of the patches of the sea floor: the '
+        'smaller, the rougher', range=(0.1, 1000.0))
+    seabed_patch: float = parameter(1.0, 'm',
+        'side of a patch of the sea floor', range=(0.01, 1000.0))
     # fmt: on
+
+    def feeder_instruments(self) -> dict[str, Any]:
+        """What `fls_detector_node` has to know of the images."""
+        if not self.images:
+            return {}
+        return {
+            'image_near_range': 0.0,
+            'image_far_range': self.max_range,
+            'image_fov_deg': self.horizontal_fov_deg,
+            'beam_width_deg': self.beam_width_deg,
+            'range_resolution': PULSE_LENGTH,
+        }
 
     def check(self) -> list[str]:
         problems = super().check()
         if len(self.obstacle_speed) != 2 or self.obstacle_speed[0] > self.obstacle_speed[-1]:
             problems.append('obstacle_speed needs two values, the least and the greatest')
+        if self.last_range >= self.first_range:
+            problems.append('last_range must be less than first_range')
         if len(self.detection_profile) % 2:
             problems.append('detection_profile needs pairs of a range and a share')
         if self.images and self.ping_timing != 'instant':
@@ -310,6 +291,5 @@ SCENARIOS: Scenarios = {
         {'late_fraction': 0.3, 'navigation_latency': 0.4, 'ping_jitter': 0.3}),
 }
 # fmt: on
-"""Name: (what it is, what differs from the defaults of `ObstacleScenario`)."""
 
 scenario = ObstacleScenario.among(SCENARIOS)

@@ -15,11 +15,12 @@ error and a bias, and from an attitude sensor with a bias. Obstacles are given b
 offset from the sonar, or as spheres on tethers, objects on the sea floor or floats at the surface.
 
 Measurements are in ROS axes, ENU and FLU; inside, all is NED and FRD as in the papers.
+In one file, since all of it draws from one generator in turn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from attrs import frozen
 import numpy as np
@@ -34,11 +35,13 @@ from sonar_imm.truth import Received, Scene, TruthTable
 
 from ..scenario import delay_ns, FIRST_STAMP_NS, lasting, stamps_of
 from .images import image_pings
-from .scenario import ObstacleScenario, scenario, SCENARIOS
+from .scenario import LATE_DELAY, ObstacleScenario, scenario, SCENARIOS
 
-# -- where obstacles are at any time: they stay, sway about their place, or move ------------------
-
-_SWAY_STEP = 0.1
+ROLL_PERIOD, PITCH_PERIOD, YAW_PERIOD, HEAVE_PERIOD = 6.0, 8.0, 11.0, 20.0
+"""Seconds, of the vehicle."""
+OUTLIER = np.array([8.0, np.radians(6.0)])
+"""Largest error of an outlier in range, m, and bearing, rad."""
+_SWAY_STEP, SWING_PERIOD = 0.1, 15.0
 WAVES = 3
 """Sinusoids that make up a swing, with periods of 0.75 to 1.3 times the stated one: narrow-band,
 as swell is. The study that docs/obstacle.md compares with has such swings."""
@@ -62,13 +65,12 @@ class Swing:
 @frozen(eq=False)
 class Path:
     """place: (3,) NED at time `meets`; speed: (2,) m/s north and east, from the time `starts` to
-    `stops`; sway: (n, 2) displacements every 0.1 s from the time 0; swing: of north and east."""
+    `stops`; sway: displacements north and east (n, 2) at times (n,)."""
 
     place: FloatArray
     meets: float = 0.0
     speed: FloatArray | None = None
-    sway: FloatArray | None = None
-    swing: tuple[Swing, Swing] | None = None
+    sway: Callable[[FloatArray], FloatArray] | None = None
     starts: float = -np.inf
     stops: float = np.inf
 
@@ -84,11 +86,7 @@ class Path:
             active = active - np.clip(self.meets, self.starts, self.stops)
             where[:, :2] += active[:, None] * self.speed
         if self.sway is not None:
-            clock = _SWAY_STEP * np.arange(len(self.sway))
-            for axis in range(2):
-                where[:, axis] += np.interp(t, clock, self.sway[:, axis])
-        if self.swing is not None:
-            where[:, :2] += np.column_stack([swing(t) for swing in self.swing])
+            where[:, :2] += self.sway(t)
         return where
 
     def velocity(self, t: FloatArray) -> FloatArray:
@@ -110,16 +108,17 @@ def paths(
 
 def _path(config: ObstacleScenario, place: FloatArray, course: float, rng: Generator) -> Path:
     if config.obstacle_motion == 'swaying':
-        return Path(place, sway=_sway(config, rng))
+        off = _sway(config, rng)
+        clock = _SWAY_STEP * np.arange(len(off))
+        return Path(place, sway=lambda t: np.stack([np.interp(t, clock, x) for x in off.T], -1))
     if config.obstacle_motion == 'swinging':
-        swing = (config.obstacle_sway, config.obstacle_swing_period)
-        return Path(place, swing=(Swing(*swing, rng), Swing(*swing, rng)))
+        swings = [Swing(config.obstacle_sway, SWING_PERIOD, rng) for _ in range(2)]
+        return Path(place, sway=lambda t: np.column_stack([swing(t) for swing in swings]))
     if config.obstacle_motion == 'moving':
         ahead = np.array([np.cos(course), np.sin(course)])
-        meets = float(place[:2] @ ahead) / config.speed
         return Path(
             place,
-            meets=meets,
+            meets=float(place[:2] @ ahead) / config.speed,
             speed=_speed(config, course, rng),
             starts=config.obstacle_starts,
             stops=config.obstacle_stops,
@@ -201,9 +200,12 @@ def simulate(config: ObstacleScenario, seed: int) -> Scene:
     """Run a scene. The same config and seed give the same scene; `truth` holds `TrueObstacle`."""
     rng = np.random.default_rng(seed)
     vehicle = _Vehicle(config, rng)
-    stamps = stamps_of(_ping_times(config, rng))
+    # Until the vehicle is `last_range` from the first obstacle.
+    step = 1.0 / config.ping_rate
+    even = np.arange(0.0, (config.first_range - config.last_range) / config.speed, step)
+    stamps = stamps_of(even + rng.uniform(-0.5, 0.5, len(even)) * config.ping_jitter * step)
     times: FloatArray = (stamps - FIRST_STAMP_NS).astype(np.float64) * 1e-9
-    obstacles = paths(config, _place(config, vehicle, rng), vehicle.course, seed)
+    obstacles = paths(config, _places(config, vehicle, rng), vehicle.course, seed)
     stretch = 1.0 + config.sound_speed_error * rng.normal()
     received = _navigate(config, vehicle, rng)
     if config.images:
@@ -220,9 +222,6 @@ def simulate(config: ObstacleScenario, seed: int) -> Scene:
     return Scene(tuple(received), truth)
 
 
-# -- the vehicle -------------------------------------------------------------------------------
-
-
 class _Vehicle:
     """Pose of the vehicle at any time, NED and FRD."""
 
@@ -231,10 +230,10 @@ class _Vehicle:
         self.course = (
             rng.uniform(-np.pi, np.pi) if config.random_course else np.radians(config.course_deg)
         )
-        self.roll = Swing(np.radians(config.roll_rms_deg), config.roll_period, rng)
-        self.pitch = Swing(np.radians(config.pitch_rms_deg), config.pitch_period, rng)
-        self.yaw = Swing(np.radians(config.yaw_rms_deg), config.yaw_period, rng)
-        self.heave = Swing(config.heave_rms, config.heave_period, rng)
+        self.roll = Swing(np.radians(config.roll_rms_deg), ROLL_PERIOD, rng)
+        self.pitch = Swing(np.radians(config.pitch_rms_deg), PITCH_PERIOD, rng)
+        self.yaw = Swing(np.radians(config.yaw_rms_deg), YAW_PERIOD, rng)
+        self.heave = Swing(config.heave_rms, HEAVE_PERIOD, rng)
         self.sway = Swing(config.sway_rms, config.sway_period, rng)
         self.lever = geometry.flip_body(config.sonar_lever)
         roll, pitch, yaw = np.radians(config.sonar_mount_rpy_deg)
@@ -265,23 +264,7 @@ class _Vehicle:
         return geometry.mounted(self.pose(t), self.lever, self.mount)
 
 
-def _ping_times(config: ObstacleScenario, rng: Generator) -> FloatArray:
-    """Times of the pings, s, until the vehicle is `last_range` from the first obstacle."""
-    step = 1.0 / config.ping_rate
-    times = np.arange(0.0, (config.first_range - config.last_range) / config.speed, step)
-    return times + rng.uniform(-0.5, 0.5, len(times)) * config.ping_jitter * step
-
-
-def _seabed(config: ObstacleScenario, along: FloatArray) -> FloatArray:
-    """Depth of the sea floor `along` the course, m: ripples of the given relief."""
-    ripple = np.sin(2.0 * np.pi * along / 37.0) + 0.6 * np.sin(2.0 * np.pi * along / 13.0 + 1.0)
-    return config.depth + config.altitude + config.seabed_relief * ripple
-
-
-# -- obstacles ---------------------------------------------------------------------------------
-
-
-def _place(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> list[FloatArray]:
+def _places(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> list[FloatArray]:
     """Positions of the obstacles, NED. The first one is `first_range` from the first ping, each
     further one `spacing` behind. The passing distance of each is drawn at random."""
     sonar = vehicle.sonar(np.zeros(()))
@@ -307,11 +290,7 @@ def _offset(config: ObstacleScenario, number: int, depth: float, rng: Generator)
     return {'seabed': seabed - 0.5, 'surface': 0.5}[config.placement] - depth
 
 
-# -- measurements ------------------------------------------------------------------------------
-
-
 def _navigate(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> list[Received]:
-    """Odometry by dead reckoning, and the altimeter."""
     last = (config.first_range - config.last_range) / config.speed + LEAD_IN
     t = np.arange(-LEAD_IN, last, 1.0 / config.navigation_rate)
     exact = 0.0 if config.ideal_navigation else 1.0
@@ -339,7 +318,10 @@ def _navigate(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> li
     turn = turned.as_rotvec() / (2.0 * _FINE)
     q = Rotation.from_matrix(geometry.flip_rotation(R)).as_quat()
     stamps = stamps_of(t + config.navigation_delay)
-    gaps = _gaps(config, t, rng)
+    gaps = np.zeros(len(t), bool)
+    if config.navigation_gaps > 0.0:
+        for start in rng.uniform(t[0], t[-1], rng.poisson(config.navigation_gaps)):
+            gaps |= (t >= start) & (t < start + config.navigation_gap)
     received = [
         Received(
             int(stamps[k]) + nanoseconds(config.navigation_latency),
@@ -356,7 +338,10 @@ def _navigate(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> li
         for k in np.flatnonzero(~gaps)
     ]
     every = max(1, round(config.navigation_rate / 2.0))
-    heights = _seabed(config, config.speed * t) - vehicle.position(t)[:, 2]
+    turns = 2.0 * np.pi * (config.speed * t)
+    ripple = np.sin(turns / 37.0) + 0.6 * np.sin(turns / 13.0 + 1.0)
+    seabed = config.depth + config.altitude + config.seabed_relief * ripple
+    heights = seabed - vehicle.position(t)[:, 2]
     heights = heights + config.altitude_std * rng.normal(size=len(t))
     received += [
         Received(
@@ -366,15 +351,6 @@ def _navigate(config: ObstacleScenario, vehicle: _Vehicle, rng: Generator) -> li
         if config.altimeter
     ]
     return received
-
-
-def _gaps(config: ObstacleScenario, t: FloatArray, rng: Generator) -> np.ndarray:
-    """True (n,) in the gaps of the navigation, of `navigation_gap` seconds each."""
-    silent = np.zeros(len(t), bool)
-    if config.navigation_gaps > 0.0:
-        for start in rng.uniform(t[0], t[-1], rng.poisson(config.navigation_gaps)):
-            silent |= (t >= start) & (t < start + config.navigation_gap)
-    return silent
 
 
 def _echoes(
@@ -410,7 +386,7 @@ def _pings(
     half = np.radians(0.5 * config.horizontal_fov_deg)
     noise = np.array([config.range_std, np.radians(config.bearing_std_deg)])
     step = np.array([config.range_step, np.radians(config.bearing_step_deg)])
-    largest = np.array([config.outlier_range, np.radians(config.outlier_bearing_deg)])
+
     received = []
     for k, stamp in enumerate(stamps):
         rows: list[FloatArray] = []
@@ -421,7 +397,7 @@ def _pings(
                 chance *= float(np.interp(echo[k, 0], profile[::2], profile[1::2]))
             seen = rng.uniform() < chance
             outlier = rng.uniform() < config.outlier_probability
-            error = noise * rng.normal(size=2) + outlier * largest * rng.uniform(-1.0, 1.0, 2)
+            error = noise * rng.normal(size=2) + outlier * OUTLIER * rng.uniform(-1.0, 1.0, 2)
             if seen and inside[k]:
                 rows.append(echo[k, :2] + error)
                 up.append(-echo[k, 2])
@@ -445,7 +421,7 @@ def _pings(
             elevation=elevation,
             frame_id='sonar',
         )
-        received.append(Received(int(stamp) + delay_ns(config, rng), detections))
+        received.append(Received(int(stamp) + delay_ns(config, LATE_DELAY, rng), detections))
     return received
 
 
@@ -459,6 +435,9 @@ def _truth(
 ) -> TrueObstacle:
     sonar, place = vehicle.sonar(times), path.at(times)
     d, azimuth = geometry.project(geometry.to_body(sonar, place), config.azimuth_model)
+    still = 'seabed' if config.placement == 'seabed' else 'fixed'
+    if path.sway is not None:
+        still = 'swaying'
     return TrueObstacle(
         track_id=number,
         stamp_ns=stamps,
@@ -468,12 +447,5 @@ def _truth(
         vertical_offset=place[:, 2] - sonar.position[:, 2],
         in_beam=_echoes(config, vehicle, times, path, 1.0)[1],
         velocity=geometry.flip_world(path.velocity(times))[:, :2],
-        does=_does(config, path, times),
+        does=np.where(path.moves(times), DOES.index('moving'), DOES.index(still)),
     )
-
-
-def _does(config: ObstacleScenario, path: Path, times: FloatArray) -> np.ndarray:
-    still = 'seabed' if config.placement == 'seabed' else 'fixed'
-    if path.sway is not None or path.swing is not None:
-        still = 'swaying'
-    return np.where(path.moves(times), DOES.index('moving'), DOES.index(still))

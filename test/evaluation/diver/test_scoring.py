@@ -12,17 +12,8 @@ from itertools import permutations
 import json
 
 from attrs import evolve
-from helpers.dive_scenes import (
-    covariance,
-    estimate_at,
-    HEADINGS,
-    legs,
-    SECOND,
-    single_run,
-    stamps,
-    START_NS,
-    truth_estimate,
-)
+from helpers import dive_scenes
+from helpers.dive_scenes import estimate_at, SECOND, single_run, START_NS, truth_estimate
 import numpy as np
 import pytest
 from scipy.stats import chi2, norm
@@ -47,23 +38,20 @@ def scored(estimates, truth, **options):
     return score(series_of(estimates), Truth.from_series(series_of(truth)), **options)
 
 
-def test_errors_drawn_from_the_stated_covariance_are_believed():
+def test_errors_drawn_from_the_stated_covariance_are_believed_and_twice_as_large_ones_not():
     estimates, truth, _ = single_run(count=2000)
     metrics = scored(estimates, truth)
     consistency = metrics['consistency']
-    assert consistency['nees_position']['believable'] and consistency['nees_state']['believable']
-    assert consistency['nis']['believable'] and consistency['nis']['dof'] == 2
+    for name in ('nees_position', 'nees_state', 'nis'):
+        assert consistency[name]['believable']
+    assert consistency['nis']['dof'] == 2
     for level, share in consistency['coverage'].items():
         # four binomial standard deviations
         p = float(level) / 100.0
         assert share == pytest.approx(p, abs=4.0 * np.sqrt(p * (1.0 - p) / 2000))
-    trace = covariance()[0, 0] + covariance()[1, 1]
+    trace = np.trace(dive_scenes.covariance()[:2, :2])
     assert metrics['position']['rmse_m'] == pytest.approx(np.sqrt(trace), rel=0.05)
-
-
-def test_errors_twice_as_large_as_stated_are_not():
-    estimates, truth, _ = single_run(count=500, spread=2.0)
-    consistency = scored(estimates, truth)['consistency']
+    consistency = scored(*single_run(count=500, spread=2.0)[:2])['consistency']
     assert not consistency['nees_position']['believable']
     assert consistency['nees_position']['mean'] == pytest.approx(8.0, rel=0.15)
     assert consistency['coverage']['95'] < 0.85
@@ -72,10 +60,8 @@ def test_errors_twice_as_large_as_stated_are_not():
 def test_numbers_of_three_known_errors():
     truth = [truth_estimate(START_NS + k * SECOND, [[0.0] * 4], [1]) for k in range(3)]
     errors = [[3.0, 4.0, 0.0, 1.0], [0.0, 1.0, 0.0, 1.0], [0.0, 2.0, 2.0, 1.0]]
-    eye = np.eye(4)
-    estimates = [
-        estimate_at(true.stamp_ns, [e], [1], stated=eye) for true, e in zip(truth, errors)
-    ]
+    pairs = zip(truth, errors)
+    estimates = [estimate_at(true.stamp_ns, [e], [1], stated=np.eye(4)) for true, e in pairs]
     metrics = scored(estimates, truth)
     assert (metrics['stamps'], metrics['span_s']) == (3, 2.0)
     assert metrics['position']['rmse_m'] == pytest.approx(np.sqrt(30.0 / 3.0))
@@ -88,12 +74,11 @@ def test_numbers_of_three_known_errors():
 def test_track_and_fixes_are_compared_at_the_same_stamps():
     """A track that begins late, and an outlier: of single fixes all count."""
     estimates, truth, times = single_run(count=40)
-    fixes = [
-        Fix(stamp_ns=stamp, position=[*(place + [0.0, 2.0 if k < 20 else 1.0]), 0.0])
-        for k, (stamp, place) in enumerate(zip(stamps(times), legs(times)[:, :2]))
-    ]
-    fixes[30] = evolve(fixes[30], position=fixes[30].position + [90.0, 0.0, 0.0])
-    metrics = scored(estimates[20:], truth, fixes=fix_series(fixes))
+    places = dive_scenes.legs(times)[:, :2] + np.repeat([[0.0, 2.0], [0.0, 1.0]], 20, axis=0)
+    places[30, 0] += 90.0
+    pairs = zip(dive_scenes.stamps(times), places)
+    fixes = fix_series([Fix(stamp_ns=stamp, position=[*place, 0.0]) for stamp, place in pairs])
+    metrics = scored(estimates[20:], truth, fixes=fixes)
     same = metrics['same_stamps']
     assert same['n'] == 20 and metrics['raw_fix']['n'] == 40
     raw = np.sqrt((20 * 4.0 + 20 * 1.0 + 90.0**2) / 40.0)
@@ -104,9 +89,10 @@ def test_track_and_fixes_are_compared_at_the_same_stamps():
 
 def test_a_lagging_track_tells_its_lag():
     times = np.arange(200) * 0.5
-    truth = [truth_estimate(at, [x], [1]) for at, x in zip(stamps(times), legs(times))]
-    estimates = [estimate_at(at, [x], [1]) for at, x in zip(stamps(times + 3.0), legs(times))]
-    lag = scored(estimates, truth)['lag']
+    states = dive_scenes.legs(times)[:, None]
+    now, late = dive_scenes.stamps(times), dive_scenes.stamps(times + 3.0)
+    truth = [truth_estimate(at, x, [1]) for at, x in zip(now, states)]
+    lag = scored([estimate_at(at, x, [1]) for at, x in zip(late, states)], truth)['lag']
     assert lag['best_s'] == pytest.approx(-3.0, abs=0.05)
     assert lag['rmse_at_best_m'] < 0.1 < lag['rmse_at_zero_m']
 
@@ -119,8 +105,7 @@ def test_several_targets_are_scored_by_gospa():
     gospa = scored(estimates, truth, cutoff=10.0)['gospa']
     # one target 5 m off, one missed at 10^2 / 2; then two hits
     assert gospa['mean_m'] == pytest.approx(np.sqrt(25.0 + 50.0) / 2.0)
-    assert gospa['missed_per_scan'] == pytest.approx(0.5)
-    assert gospa['false_per_scan'] == 0.0
+    assert gospa['missed_per_scan'] == pytest.approx(0.5) and gospa['false_per_scan'] == 0.0
 
 
 def two_divers(errors, stated_std, fix_std, seed=4):
@@ -135,22 +120,18 @@ def two_divers(errors, stated_std, fix_std, seed=4):
         truth.append(truth_estimate(stamp, there, [1, 2]))
         state = there + np.pad(error, [(0, 0), (0, 2)])
         estimates.append(estimate_at(stamp, state, [5, 6], stated=stated))
-        for place in there:
-            noisy = [*(place[:2] + fix_std * rng.normal(size=2)), 0.0]
+        for place in there[:, :2]:
+            noisy = [*(place + fix_std * rng.normal(size=2)), 0.0]
             fixes.append(Fix(stamp_ns=stamp, position=noisy))
     return estimates, truth, fix_series(fixes)
 
 
-def lost_for_a_while(count=200):
-    """Errors of a metre, but the first diver's track is 25 m off for two scans of five."""
-    errors = np.random.default_rng(1).normal(size=(count, 2, 2))
-    errors[: 2 * count // 5, 0] += [25.0, 0.0]
-    return errors
-
-
 def test_no_verdict_is_given_that_pairs_beyond_the_cutoff_would_change():
-    """Judged by the pairs within 10 m the tracker was too cautious, within 50 m overconfident."""
-    estimates, truth, fixes = two_divers(lost_for_a_while(), 3.0, 1.0)
+    """The first diver's track is 25 m off for two scans of five: judged by the pairs within 10 m
+    the tracker was too cautious, within 50 m overconfident."""
+    errors = np.random.default_rng(1).normal(size=(200, 2, 2))
+    errors[:80, 0] += [25.0, 0.0]
+    estimates, truth, fixes = two_divers(errors, 3.0, 1.0)
     within_10 = scored(estimates, truth, fixes=fixes)
     assert within_10['cutoff_m'] == 10.0 and within_10['position']['rmse_m'] < 1.6
     assert within_10['consistency']['coverage']['95'] > 0.99
@@ -161,12 +142,12 @@ def test_no_verdict_is_given_that_pairs_beyond_the_cutoff_would_change():
     assert sentence.startswith('The divers are found 80 % of the time, within 10 m; then ')
     assert 'cannot be said: 20 % of the estimates' in sentence
     assert 'cautious' not in sentence and 'removes' not in sentence
-    assert lines(METRICS, within_10)[0][0] == 'divers found'
     within_50 = scored(estimates, truth, fixes=fixes, cutoff=50.0)
     assert within_50['consistency']['verdict'] == 'overconfident'
     assert within_50['tracks']['completeness'] == 1.0
     assert 'The tracker is overconfident' in summary_sentence(within_50)
-    assert lines(METRICS, within_50)[0][0] != 'divers found'
+    first = [lines(METRICS, metrics)[0][0] for metrics in (within_10, within_50)]
+    assert first[0] == 'divers found' != first[1]
 
 
 def test_the_cutoff_follows_the_errors_of_the_fixes():
@@ -194,33 +175,32 @@ def test_a_verdict_that_no_pair_would_change_is_given():
     assert 'consistent with the errors' in summary_sentence(metrics)
 
 
-def test_a_singular_state_covariance_is_counted_not_believed():
-    estimates, truth, _ = single_run(count=30)
-    certain = covariance()
+def test_singular_covariances_are_counted_and_hits_divided_by_their_degrees_of_freedom():
+    estimates, truth, _ = single_run(count=60)
+    certain = dive_scenes.covariance()
     certain[3] = certain[:, 3] = 0.0
     estimates[4] = estimate_at(estimates[4].stamp_ns, estimates[4].state, [7], stated=certain)
-    consistency = scored(estimates, truth)['consistency']
-    assert consistency['singular_state_covariances'] == 1
-    assert consistency['nees_state']['n'] == 29 and consistency['nees_position']['n'] == 30
-
-
-def test_hits_with_different_degrees_of_freedom_are_divided_by_them():
-    estimates, truth, _ = single_run(count=60)
     rng = np.random.default_rng(5)
     for k, estimate in enumerate(estimates):
         estimate.extras['nis_dof'] = np.array([2 + k % 3], np.uint16)
         estimate.extras['nis'] = rng.chisquare(2 + k % 3, 1)
-    nis = scored(estimates, truth)['consistency']['nis']
-    assert nis['divided_by_dof'] and nis['believable']
-    assert nis['low'] < 1.0 < nis['high']
+    consistency = scored(estimates, truth)['consistency']
+    assert consistency['singular_state_covariances'] == 1
+    assert consistency['nees_state']['n'] == 59 and consistency['nees_position']['n'] == 60
+    nis = consistency['nis']
+    assert nis['divided_by_dof'] and nis['believable'] and nis['low'] < 1.0 < nis['high']
 
 
-def test_without_truth_only_what_needs_none_is_scored():
-    estimates, _, _ = single_run(count=50)
+def test_without_truth_or_estimates_only_what_needs_none_is_scored():
+    estimates, truth, _ = single_run(count=50)
     metrics = score(series_of(estimates))
     assert 'position' not in metrics and 'nees_position' not in metrics['consistency']
     assert metrics['consistency']['nis']['n'] == 50
     assert sum(metrics['models']['mean_probability'].values()) == pytest.approx(1.0)
+    for known in ([], truth):
+        metrics = scored([], known, fixes=fix_series([]))
+        assert metrics['tracks_confirmed'] == 0
+        json.dumps(finite(metrics), allow_nan=False)
 
 
 def test_models_are_counted_by_how_probable_they_are_and_how_often_they_lead():
@@ -232,13 +212,6 @@ def test_models_are_counted_by_how_probable_they_are_and_how_often_they_lead():
     assert models['leads'] == {'east': 4 / 17, 'north': 13 / 17}
     assert models['mean_probability']['east'] == pytest.approx((4 * 0.8 + 13 * 0.4) / 17)
     assert models['leader_changes_per_minute'] == pytest.approx(15.0)
-
-
-@pytest.mark.parametrize('truth', [[], single_run(count=5)[1]])
-def test_an_empty_run_gives_numbers_json_can_hold(truth):
-    metrics = scored([], truth, fixes=fix_series([]))
-    assert metrics['tracks_confirmed'] == 0
-    json.dumps(finite(metrics), allow_nan=False)
 
 
 def in_depth(estimates, truth, *, spread=1.0, depth=25.0):
@@ -270,24 +243,21 @@ def test_depth_is_scored_where_both_have_it():
     assert wrong['rmse_m'] == pytest.approx(6.0, rel=0.1) and not wrong['nees_3d']['believable']
 
 
-def words_of(tracked, raw):
-    return {
-        'position': {'n': 5, 'rmse_m': tracked},
-        'raw_fix': {'n': 5, 'rmse_m': raw, 'beyond': 0},
+@pytest.mark.parametrize(
+    'tracked, raw, said',
+    [(0.5, 0.0, 'the truth itself'), (0.5, 2.0, 'removes 75 %'), (2.0, 1.0, 'adds 100 %')],
+)
+def test_the_raw_fixes_may_be_the_truth_itself(tracked, raw, said):
+    metrics = {
+        'position': {'n': 5, 'rmse_m': tracked}, 'raw_fix': {'n': 5, 'rmse_m': raw, 'beyond': 0},
         'same_stamps': {'n': 5, 'track_rmse_m': tracked, 'raw_rmse_m': raw},
         'consistency': {'coverage': {'95': 0.95}, 'verdict': 'consistent'},
-    }
-
-
-def test_the_raw_fixes_may_be_the_truth_itself():
-    assert 'the truth itself' in summary_sentence(words_of(0.5, 0.0))
-    assert 'removes 75 %' in summary_sentence(words_of(0.5, 2.0))
-    assert 'adds 100 %' in summary_sentence(words_of(2.0, 1.0))
+    }  # fmt: skip
+    assert said in summary_sentence(metrics)
 
 
 def test_ellipses_hold_the_probability_they_claim():
-    covariance = np.array([[[4.0, 1.2], [1.2, 1.0]]])
-    mean = np.array([[3.0, -2.0]])
+    covariance, mean = np.array([[[4.0, 1.2], [1.2, 1.0]]]), np.array([[3.0, -2.0]])
     outline = figures.outlines(mean, covariance, probability=0.9)
     assert np.isnan(outline[-1]).all()
     offset = outline[:-1] - mean
@@ -295,45 +265,37 @@ def test_ellipses_hold_the_probability_they_claim():
     np.testing.assert_allclose(distance, chi2.ppf(0.9, 2), rtol=1e-12)
 
 
-def test_models_are_ordered_by_heading_with_the_others_below():
+def test_models_are_ordered_by_heading_which_of_two_families_is_one_row():
     names = ('heading_090', 'hover', 'heading_000')
-    order = [names[i] for i in figures.model_order(names)]
-    assert order == ['hover', 'heading_000', 'heading_090']
+    assert [names[i] for i in figures.model_order(names)] == [
+        'hover',
+        'heading_000',
+        'heading_090',
+    ]
     assert figures.model_label('heading_022') == '22°'
-
-
-def test_the_same_heading_of_two_families_is_one_row():
     names = ('steady_heading_000', 'steady_hover', 'brisk_heading_000', 'brisk_hover', 'quiet')
     found, added = figures.headings_together(names, np.array([[0.1, 0.2, 0.3, 0.25, 0.15]]))
     assert found == ('heading_000', 'hover', 'quiet')
     np.testing.assert_allclose(added, [[0.4, 0.45, 0.15]])
     alone = figures.headings_together(('heading_000', 'hover'), np.eye(2))
-    assert alone[0] == ('heading_000', 'hover')
-    np.testing.assert_array_equal(alone[1], np.eye(2))
+    assert alone[0] == ('heading_000', 'hover') and np.array_equal(alone[1], np.eye(2))
 
 
-def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
+def test_the_map_shows_tracks_and_truth_but_not_the_clutter_and_names_of_targets():
     estimates, true_rows, _ = single_run(count=60)
-    truth, clutter = Truth.from_series(series_of(true_rows)), np.array([[500.0, 500.0]])
-    series = series_of(estimates)
-    fixes = fix_series([Fix(stamp_ns=1, position=[*clutter[0], 0.0])])
+    truth, series = Truth.from_series(series_of(true_rows)), series_of(estimates)
+    fixes = fix_series([Fix(stamp_ns=1, position=[500.0, 500.0, 0.0])])
     assert fixes.place_covariance.shape == (1, 3, 3)
     figure = figures.map_figure(series, truth, fixes)
     low, high = figure.layout.xaxis.range
     assert low < series.state[:, 0].min() and series.state[:, 0].max() < high < 500.0
     assert figure.layout.yaxis.scaleanchor == 'x'
     assert view_of(np.empty((0, 2))) == (None, None)
-
-
-def test_tracks_have_the_names_of_their_targets():
-    estimates, _, _ = single_run(count=20)
-    series = series_of(estimates)
     series.target_id[:] = 4
     drawn = figures.map_figure(series, None, None, {'4': 'Schmidt <b>'})
-    (track,) = np.unique(series.track_id)
-    assert f'Schmidt &lt;b&gt; (track {track})' in {each.name for each in drawn.data}
+    assert 'Schmidt &lt;b&gt; (track 7)' in {each.name for each in drawn.data}
     section = next(iter(figures.sections({}, series, names={'4': 'Schmidt'})))
-    assert f'Schmidt (track {track})' in {each.name for each in section.figure.data}
+    assert 'Schmidt (track 7)' in {each.name for each in section.figure.data}
 
 
 def test_the_error_of_a_track_is_drawn_over_the_seconds_of_the_run_in_its_band():
@@ -344,15 +306,14 @@ def test_the_error_of_a_track_is_drawn_over_the_seconds_of_the_run_in_its_band()
     figure = figures.error_figure(matching, 7)
     axes = {name for name in figure.to_dict()['layout'] if name.startswith('yaxis')}
     assert axes == {'yaxis', 'yaxis2'}
-    drawn = figure.data
-    lines = [line for line in drawn if line.name == 'error of the track']
-    bands = [line for line in drawn if line.name == 'predicted 95 % band']
-    assert len(lines) == len(bands) == 2
-    for axis, line in enumerate(lines):
+    names = 'error of the track', 'predicted 95 % band'
+    drawn, bands = ([line for line in figure.data if line.name == name] for name in names)
+    for axis, (line, band) in enumerate(zip(drawn, bands, strict=True)):
         np.testing.assert_allclose(line.x, times[10:], atol=1e-3)
         np.testing.assert_allclose(line.y, matching.error[10:, axis], atol=1e-3)
-        half = norm.ppf(0.975) * np.sqrt(covariance()[axis, axis])
-        np.testing.assert_allclose(np.sort(bands[axis].y), np.repeat([-half, half], 50), rtol=1e-3)
+        half = norm.ppf(0.975) * np.sqrt(dive_scenes.covariance()[axis, axis])
+        np.testing.assert_allclose(np.sort(band.y), np.repeat([-half, half], 50), rtol=1e-3)
+    assert len(drawn) == 2
 
 
 # -- who follows whom, against brute force and by hand --------------------------------------------
@@ -380,48 +341,28 @@ def test_assignment_has_the_least_total_of_all_assignments(seed):
     assert assign(np.array([[9.9, 50.0], [50.0, 10.0]]), 10.0) == [(0, 0)]
 
 
-def test_what_is_left_over_on_both_sides_is_kept_apart():
-    matching = scene([[(1.0, 0.0), (60.0, 0.0)], [(30.0, 0.0)]], [[1, 2], [2]])
-    assert matching.distance.tolist() == [1.0, 0.0]
-    assert matching.beyond_row.tolist() == [1]
-    assert matching.beyond_truth[:, 0].tolist() == [30.0]
-
-
-def test_one_target_with_one_track_is_matched_however_far():
-    matching = scene([[(1000.0, 0.0)]], [[7]], targets=[(0.0, 0.0)])
-    assert matching.distance.tolist() == [1000.0]
-
-
-def test_errors_are_estimate_minus_truth():
+def test_errors_are_estimate_minus_truth_and_what_is_left_over_is_kept_apart():
     matching = scene([[(31.0, -2.0), (0.5, 0.0)]], [[2, 1]])
     order = np.argsort(matching.target)
     np.testing.assert_allclose(matching.error[order, :2], [[0.5, 0.0], [1.0, -2.0]])
+    matching = scene([[(1.0, 0.0), (60.0, 0.0)], [(30.0, 0.0)]], [[1, 2], [2]])
+    assert matching.distance.tolist() == [1.0, 0.0] and matching.beyond_row.tolist() == [1]
+    assert matching.beyond_truth[:, 0].tolist() == [30.0]
+    # One target with one track is matched however far.
+    alone = scene([[(1000.0, 0.0)]], [[7]], targets=[(0.0, 0.0)])
+    assert alone.distance.tolist() == [1000.0]
 
 
-def test_an_identity_switch_is_counted_once_and_a_gap_is_none():
+def test_a_switch_is_counted_once_a_gap_is_none_and_a_track_on_nothing_is_false():
     places = [[(0, 0), (30, 0)]] * 3 + [[(30, 0)]] + [[(0, 0), (30, 0)]] * 2
-    ids = [[1, 2], [1, 2], [2, 1], [1], [2, 1], [2, 1]]
-    summary = track_summary(scene(places, ids))
-    assert summary['identity_switches'] == 2
-    assert summary['fragmentations'] == 1
-    assert summary['completeness'] == pytest.approx(11 / 12)
-    assert summary['false_tracks'] == 0
-
-
-def test_a_track_on_nothing_is_false_and_no_estimates_find_nothing():
-    places = [[(0, 0), (30, 0), (15, 200)]] * 4
-    summary = track_summary(scene(places, [[1, 2, 3]] * 4))
+    summary = track_summary(scene(places, [[1, 2], [1, 2], [2, 1], [1], [2, 1], [2, 1]]))
+    assert (summary['identity_switches'], summary['fragmentations']) == (2, 1)
+    assert summary['completeness'] == pytest.approx(11 / 12) and summary['false_tracks'] == 0
+    summary = track_summary(scene([[(0, 0), (30, 0), (15, 200)]] * 4, [[1, 2, 3]] * 4))
     assert summary['false_tracks'] == 1 and summary['tracks'] == 3
     assert summary['false_rows_per_scan'] == 1.0 and summary['true_targets'] == 2
     matching = scene([[]], [[]])
     assert len(matching.row) == 0 and track_summary(matching)['completeness'] == 0.0
-
-
-def test_scans_without_truth_are_not_scored():
-    estimates = [estimate_at(START_NS + k * SECOND, [[0.0, 0.0, 0.0, 0.0]], [1]) for k in range(5)]
-    truths = [truth_estimate(START_NS + k * SECOND, [[0.0, 0.0, 0.0, 0.0]], [1]) for k in (1, 2)]
-    matching = match(series_of(estimates), Truth.from_series(series_of(truths)), cutoff=10.0)
-    assert len(matching.scan_ns) == 2 and matching.scored.sum() == 2
 
 
 # -- estimates as flat arrays ---------------------------------------------------------------------
@@ -431,37 +372,29 @@ STATES = np.array([[1.0, 2.0, 0.5, -0.5], [3.0, 4.0, 0.0, 0.8]])
 
 def test_rows_come_out_by_stamp_with_their_columns():
     late = estimate_at(START_NS + 5, STATES, [4, 9], nis=[1.5, np.nan])
-    early = estimate_at(START_NS, STATES[:1], [4])
-    series = series_of([late, early])
+    series = series_of([late, estimate_at(START_NS, STATES[:1], [4], tentative=True)])
     assert series.stamp_ns.tolist() == [START_NS, START_NS + 5, START_NS + 5]
     assert series.track_id.tolist() == [4, 4, 9]
     np.testing.assert_array_equal(series.state[1:], STATES)
-    np.testing.assert_array_equal(series.covariance[2], covariance())
-    assert series.model_names == HEADINGS
+    np.testing.assert_array_equal(series.covariance[2], dive_scenes.covariance())
+    assert series.model_names == dive_scenes.HEADINGS
     assert series.nis[1] == 1.5 and np.isnan(series.nis[0])
+    assert series.confirmed().stamp_ns.tolist() == [START_NS + 5] * 2
+    truth = series_of([truth_estimate(START_NS, STATES, [1, 2])])
+    np.testing.assert_array_equal(truth.state, STATES)
+    assert np.isnan(truth.covariance).all()
 
 
-def test_scans_without_rows_are_remembered_and_nothing_makes_an_empty_series():
+def test_scans_without_rows_are_remembered_and_without_truth_not_scored():
     nothing = estimate_at(START_NS, np.empty((0, 4)), [])
     series = series_of([nothing, estimate_at(START_NS + 1, STATES[:1], [4])])
-    assert series.scan_ns.tolist() == [START_NS, START_NS + 1]
-    assert len(series) == 1
+    assert series.scan_ns.tolist() == [START_NS, START_NS + 1] and len(series) == 1
     series = series_of([])
-    assert len(series) == 0 and len(series.scan_ns) == 0
-    assert series.longest_track() is None
-
-
-def test_truth_states_no_covariance():
-    series = series_of([truth_estimate(START_NS, STATES, [1, 2])])
-    np.testing.assert_array_equal(series.state, STATES)
-    assert np.isnan(series.covariance).all()
-
-
-def test_tentative_rows_are_left_out_of_confirmed():
-    first, tentative = (
-        estimate_at(START_NS + k, STATES[:1], [4], tentative=k == 0) for k in (1, 0)
-    )
-    assert series_of([tentative, first]).confirmed().stamp_ns.tolist() == [START_NS + 1]
+    assert len(series) == len(series.scan_ns) == 0 and series.longest_track() is None
+    estimates = [estimate_at(START_NS + k * SECOND, [[0.0] * 4], [1]) for k in range(5)]
+    truths = [truth_estimate(START_NS + k * SECOND, [[0.0] * 4], [1]) for k in (1, 2)]
+    matching = match(series_of(estimates), Truth.from_series(series_of(truths)), cutoff=10.0)
+    assert len(matching.scan_ns) == 2 and matching.scored.sum() == 2
 
 
 def test_a_table_of_something_else_and_two_runs_in_one_are_refused():
@@ -470,19 +403,15 @@ def test_a_table_of_something_else_and_two_runs_in_one_are_refused():
     with pytest.raises(ValueError, match="no column 'py'"):
         series_of([other])
     first = estimate_at(START_NS, STATES[:1], [4])
-    one = np.ones((1, 1))
-    second = evolve(first, stamp_ns=START_NS + 1, model_names=('cv',), probabilities=one)
+    second = {'stamp_ns': START_NS + 1, 'model_names': ('cv',), 'probabilities': np.ones((1, 1))}
     with pytest.raises(ValueError, match='more than one run'):
-        series_of([first, second])
+        series_of([first, evolve(first, **second)])
 
 
 # -- truth ----------------------------------------------------------------------------------------
 
-PATH = TruthPath(
-    1,
-    START_NS + np.array([0, 2, 100]) * SECOND,
-    np.array([[0.0, 0.0, 1.0, 0.0], [4.0, -2.0, 3.0, 1.0], [9.0, 9.0, 0.0, 0.0]]),
-)
+PLACES = np.array([[0.0, 0.0, 1.0, 0.0], [4.0, -2.0, 3.0, 1.0], [9.0, 9.0, 0.0, 0.0]])
+PATH = TruthPath(1, START_NS + np.array([0, 2, 100]) * SECOND, PLACES)
 
 
 def at(seconds, **options):
@@ -490,42 +419,23 @@ def at(seconds, **options):
     return PATH.at(stamps, **{'max_gap': 10.0, **options})
 
 
-def test_between_two_points_truth_is_a_straight_line():
+def test_truth_is_a_straight_line_between_two_points_and_unknown_beyond_and_across_gaps():
     np.testing.assert_allclose(at(0.5)[0], [1.0, -0.5, 1.5, 0.25], atol=1e-12)
-
-
-@pytest.mark.parametrize('seconds', [-0.001, 100.001])
-def test_beyond_its_ends_truth_is_unknown(seconds):
-    assert np.isnan(at(seconds)).all()
-
-
-def test_across_a_long_gap_truth_is_unknown_but_its_ends_are_known():
-    assert np.isnan(at(50.0)).all()
+    assert np.isnan(at([-0.001, 50.0, 100.001])).all()
     np.testing.assert_array_equal(at([2.0, 100.0])[:, 0], [4.0, 9.0])
     assert np.isfinite(at(50.0, max_gap=98.0)).all()
-
-
-def test_nanoseconds_are_not_lost_in_big_stamps():
     fast = TruthPath(1, START_NS + np.array([0, 1000]), np.array([[0.0] * 4, [1000.0] * 4]))
     assert fast.at(np.array([START_NS + 7]), max_gap=1.0)[0, 0] == pytest.approx(7.0, abs=1e-9)
+    later = Truth((PATH,)).shifted(0.5)
+    np.testing.assert_allclose(later.at(np.array([START_NS]))[0, 0], at(0.5)[0])
 
 
-def test_a_lag_compares_with_later_truth():
-    shifted = Truth((PATH,)).shifted(0.5)
-    np.testing.assert_allclose(shifted.at(np.array([START_NS]))[0, 0], at(0.5)[0])
-
-
-def test_targets_are_told_apart_and_bad_rows_left_out():
+def test_targets_are_told_apart_bad_rows_left_out_and_of_repeated_stamps_the_last_counts():
     rows = [
         truth_estimate(START_NS + k, [[k, 0, 0, 0], [5, k if k else np.nan, 0, 0]], [1, 2])
         for k in range(3)
     ]
-    truth = Truth.from_series(series_of(rows))
+    truth = Truth.from_series(series_of([*rows, truth_estimate(START_NS, [[7, 0, 0, 0]], [1])]))
     assert [path.track_id for path in truth.paths] == [1, 2]
     assert [len(path.stamp_ns) for path in truth.paths] == [3, 2]
-
-
-def test_of_repeated_stamps_the_last_counts():
-    rows = [truth_estimate(START_NS, [[x, 0, 0, 0]], [1]) for x in (1.0, 2.0)]
-    (path,) = Truth.from_series(series_of(rows)).paths
-    assert path.state[:, 0].tolist() == [2.0]
+    assert truth.paths[0].state[:, 0].tolist() == [7.0, 1.0, 2.0]

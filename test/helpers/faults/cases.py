@@ -85,8 +85,8 @@ class Case:
     @property
     def period(self):
         """Seconds between two messages of the primary input."""
-        stamps = [message.origin_ns for message in self.messages() if message.primary]
-        return (stamps[-1] - stamps[0]) / (len(stamps) - 1) / SECOND
+        first, *_, last = (each.origin_ns for each in self.messages() if each.primary)
+        return (last - first) / (self.count - 1) / SECOND
 
     def messages(self):
         """What is sent when nothing goes wrong."""
@@ -103,19 +103,14 @@ class Case:
 @functools.cache
 def _messages(case):
     with BagReader(BAGS / case.bag) as bag:
-        names = {entry.name for entry in inputs_of(case.system)}
+        names, recorded = {entry.name for entry in inputs_of(case.system)}, []
         there = {topic.name: topic.name.lstrip('/') for topic in bag.topics}
         wanted = {topic: name for topic, name in there.items() if name in names}
         inputs = fitting_topics(bag, case.system, wanted)
-        recorded = [
-            Message(
-                inputs[item.topic].name,
-                deserialize_message(bytes(item.raw), message_class(item.type_name)),
-                inputs[item.topic].name == case.primary,
-                0,
-            )
-            for item in bag.messages([*inputs])
-        ]
+        for item in bag.messages([*inputs]):
+            content = deserialize_message(bytes(item.raw), message_class(item.type_name))
+            name = inputs[item.topic].name
+            recorded.append(Message(name, content, name == case.primary, 0))
     stamps = [item.stamp_ns for item in recorded if item.primary]
     length = stamps[-1] - stamps[0] + (stamps[-1] - stamps[0]) // (len(stamps) - 1)
     played = []

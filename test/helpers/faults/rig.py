@@ -18,30 +18,27 @@ from typing import Any
 from unittest import mock
 
 from attrs import define, field, frozen
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import pytest
-from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
-from rclpy.parameter import Parameter, parameter_value_to_python
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from scipy.stats import chi2
 from std_srvs.srv import SetBool, Trigger
 
 from sonar_imm.estimates import Estimate
-from sonar_imm.nodes.messages import make
 from sonar_imm.nodes.qos import lockstep_qos
-from sonar_imm_tools.replay.harness import (
-    local_discovery,
-    NodeProcess,
-    reserved_domain_id,
-    START_LIMIT,
-)
+from sonar_imm_tools.replay import harness
+from sonar_imm_tools.replay.harness import local_discovery, reserved_domain_id
 from sonar_imm_tools.replay.link import Link
 from sonar_imm_tools.replay.lockstep import LockStep, Recorder
 
 from .cases import Action, Message, SECOND
 
 TESTS = str(Path(__file__).resolve().parents[2])
+QUICK_NODE = 'helpers.faults.quick_node'
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 NO_LOSS = re.compile(r'count: (used|late|poses|restarts|bins.*)$|.* received$|doubtful: .*')
 """Counts of what was not lost."""
@@ -54,9 +51,9 @@ _REPORTS = 12
 @frozen
 class Outcome:
     """What a fault did. recovered: messages on the primary input until all later estimates agree
-    with the undisturbed run, None for never; losses: counted in /diagnostics, by reason; levels
-    and words: of /diagnostics while it lasted, and of the log, where some are said once;
-    estimates: in the rest, of how many; answered: whether the node goes on answering messages."""
+    with the undisturbed run, None for never; estimates: in the rest, of how many; losses: counted
+    in /diagnostics, by reason; levels, words: of /diagnostics meanwhile, and of the log; answered:
+    whether the node goes on answering messages."""
 
     recovered: int | None
     estimates: tuple[int, int]
@@ -132,19 +129,17 @@ class Rig:
         if self._lossless:
             arguments += ['-p', 'max_wait:=0.0']
         topics = dict.fromkeys(message.topic for message in case.messages())
-        for name in (*(topics if self._lossless else ()), f'{case.system}/estimate'):
-            end = 'publisher' if name.endswith('estimate') else 'subscription'
+        ends = [f'{case.system}/estimate.publisher']
+        ends += [f'{name}.subscription' for name in topics if self._lossless]
+        for end in ends:
             for policy in ('history:=keep_all', 'reliability:=reliable'):
-                arguments += ['-p', f'qos_overrides./{name}.{end}.{policy}']
+                arguments += ['-p', f'qos_overrides./{end}.{policy}']
         self.domain = enter(reserved_domain_id())
         with self._discovery():
             search = os.pathsep.join(filter(None, [TESTS, os.environ.get('PYTHONPATH')]))
             with mock.patch.dict(os.environ, PYTHONPATH=search):
-                process = NodeProcess(
-                    case.system,
-                    domain_id=self.domain,
-                    arguments=arguments,
-                    module='helpers.faults.quick_node',
+                process = harness.NodeProcess(
+                    case.system, domain_id=self.domain, arguments=arguments, module=QUICK_NODE
                 )
             self.node = enter(process)
             self.link = enter(Link('rig', domain_id=self.domain))
@@ -163,7 +158,7 @@ class Rig:
 
     def connect(self):
         """Wait until the node hears."""
-        self.lockstep.connect(self.publishers.values(), START_LIMIT)
+        self.lockstep.connect(self.publishers.values(), harness.START_LIMIT)
 
     def __enter__(self):
         return self
@@ -184,7 +179,6 @@ class Rig:
     def send_at_once(self, messages):
         """Send messages without waiting, and then wait for all answers."""
         sent = time.monotonic()
-        messages = list(messages)
         for message in messages:
             self.publishers[message.topic].publish(message.content)
         self.lockstep.follow(len(messages), 'all', sent)
@@ -200,52 +194,38 @@ class Rig:
         return self.link.node.create_publisher(self._classes[topic], f'/{topic}', qos)
 
     def reset(self):
-        assert self.call(Trigger, 'reset', Trigger.Request()).success
+        assert self.call(Trigger, 'reset').success
 
     def enable(self, on):
-        assert self.call(SetBool, 'enable', SetBool.Request(data=on)).success
+        assert self.call(SetBool, 'enable', data=on).success
 
     def tell_clock(self, stamp_ns):
         """Publish on /clock."""
         seconds, nanoseconds = divmod(stamp_ns, SECOND)
-        self.clock.publish(
-            Clock(clock=make('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds))
-        )
+        self.clock.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
 
     def wait_for_clock(self, stamp_ns, *, back):
         """Publish on /clock until the node lives at that time; back: until it said so."""
-        logged = self.node.log().count('/clock is back')
+        logged = self.node.log().count('/clock is back') + back
 
         def there():
             self.tell_clock(stamp_ns)
-            return not back or self.node.log().count('/clock is back') > logged
+            return self.node.log().count('/clock is back') >= logged
 
         assert self.wait_for(there)
 
-    def set_parameters(self, atomically=False, **values):
-        """Set parameters from outside; gives a result each, or one when `atomically`."""
-        parameters = [
-            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
-        ]
-        if atomically:
-            atomic = SetParametersAtomically.Request(parameters=parameters)
-            name = 'set_parameters_atomically'
-            return [self.call(SetParametersAtomically, name, atomic).result]
-        request = SetParameters.Request(parameters=parameters)
-        return list(self.call(SetParameters, 'set_parameters', request).results)
+    def set_parameters(self, **values):
+        """Set parameters from outside: whether each was taken."""
+        given = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        results = self.call(SetParameters, 'set_parameters', parameters=given).results
+        return [each.successful for each in results]
 
-    def parameters(self, *names):
-        """The values of parameters."""
-        request = GetParameters.Request(names=list(names))
-        answer = self.call(GetParameters, 'get_parameters', request)
-        return [parameter_value_to_python(value) for value in answer.values]
-
-    def call(self, service, name, request):
+    def call(self, service, name, **request):
         """Call a service of the node."""
         client = self.link.node.create_client(service, f'/{self.case.system}/{name}')
         try:
             assert self.wait_for(client.service_is_ready)
-            future = client.call_async(request)
+            future = client.call_async(service.Request(**request))
             assert self.wait_for(future.done)
             return future.result()
         finally:
@@ -264,10 +244,8 @@ class Rig:
 
     def play(self, steps, reports=0):
         """Send messages and do actions; gives the estimates that were published meanwhile.
-
         reports: how many of /diagnostics are waited for on the way: a level rises when a finding
-        is there in two periods, and lock-step may be done in less.
-        """
+        is there in two periods, and lock-step may be done in less."""
         start = len(self.recorder)
         every = len(steps) // reports + 1 if reports else len(steps) + 1
         for number, step in enumerate(steps, start=1):
@@ -297,11 +275,8 @@ class Rig:
         self.fresh_diagnostics()
         found = first_words(self.play(rest))
         self.fresh_diagnostics()
-        origins = {
-            step.stamp_ns: step.origin_ns
-            for step in rest
-            if isinstance(step, Message) and step.primary
-        }
+        sent = [step for step in rest if isinstance(step, Message) and step.primary]
+        origins = {step.stamp_ns: step.origin_ns for step in sent}
         held = [
             stamp in found and agrees(found[stamp], expected[origin])
             for stamp, origin in origins.items()
@@ -322,10 +297,8 @@ class Rig:
     def _advertise(self):
         self.publishers = {topic: self.peer(topic, lockstep_qos()) for topic in self._classes}
         if self.lockstep.counts.messages:
-            stamps = self.wait_for(
-                lambda: all(p.get_subscription_count() for p in self.publishers.values())
-            )
-            assert stamps
+            made = self.publishers.values()
+            assert self.wait_for(lambda: all(each.get_subscription_count() for each in made))
 
 
 def first_words(estimates):
@@ -384,21 +357,15 @@ def _near(a, b):
 def _certain(estimate):
     """The rows that somebody would use."""
     extras, keep = estimate.extras, np.ones(len(estimate), bool)
-    if 'track_state' in extras:
-        keep &= extras['track_state'] > 0
-    if 'existence' in extras:
-        keep &= ~(extras['existence'] <= 0.5)  # NaN where it is not estimated
-    if 'valid' in extras:
-        keep &= extras['valid'] > 0
+    for name, least in (('track_state', 0.0), ('existence', 0.5), ('valid', 0.0)):
+        if name in extras:
+            keep &= ~(extras[name] <= least)  # NaN where it is not estimated
     return Estimate(
         stamp_ns=estimate.stamp_ns, frame_id=estimate.frame_id, xyz=estimate.xyz[keep],
         state_names=estimate.state_names, state=estimate.state[keep],
         covariance=estimate.covariance[keep],
         extras={name: column[keep] for name, column in extras.items()},
     )  # fmt: skip
-
-
-# -- processes of nodes without a rig --
 
 
 def wait_until_ready(nodes, limit=300.0):

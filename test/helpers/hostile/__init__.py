@@ -8,7 +8,7 @@
 
 """Hostile input: messages as a wire could bring them, and what must hold whatever they are.
 
-`schema`: messages as trees of plain values by their definitions. `streams`: good messages of every
-input and type of each system. `mutations`: what is done to them. `properties`: what must hold.
-`runs`: a tracker under a stream of good and bad messages, or with extreme parameters.
+`streams`: good messages of every input and type of each system. `runs`: what is done to them, and
+a tracker under a stream of good and bad ones, or with extreme parameters. `properties`: what must
+hold. `files`, `states`: damaged files and states.
 """

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 from concurrent.futures import ProcessPoolExecutor
+import itertools
 import json
 from pathlib import Path
 import resource
@@ -40,17 +41,16 @@ MOST_EXAMPLES = 500
 """Batches of one search of hypothesis, which remembers those it has tried."""
 
 
-def messages(system, cases, first_seed=0):
+def messages(system, cases):
     """Send `cases` hostile messages or more; what happened, as plain values."""
-    tally, failures, start, number = Tally(), [], process_time(), first_seed
-    grown = 0.0
-    while tally.cases < cases:
+    tally, failures, start, grown = Tally(), [], process_time(), 0.0
+    for number in itertools.count():
+        wanted = min(MOST_EXAMPLES, -(-(cases - tally.cases) // BATCH))
 
         @seed(number)
         @settings(
-            max_examples=min(MOST_EXAMPLES, -(-(cases - tally.cases) // BATCH)), deadline=None,
-            database=None, phases=[Phase.generate, Phase.shrink],
-            suppress_health_check=list(HealthCheck),
+            max_examples=wanted, deadline=None, database=None,
+            phases=[Phase.generate, Phase.shrink], suppress_health_check=[*HealthCheck],
         )  # fmt: skip
         @given(batch=batches(system))
         def search(batch):
@@ -60,35 +60,32 @@ def messages(system, cases, first_seed=0):
             search()
         except BaseException as error:  # groups of several failures too
             failures.append(_text_of(error))
-            if len(failures) == 5:
-                break
-        number += 1
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
         grown = grown or peak
-    slow = np.sort(tally.seconds)
+        if tally.cases >= cases or len(failures) == 5:
+            break
+    slow = 1e3 * np.sort(tally.seconds)
     return {
         'cases': tally.cases, 'read': tally.read, 'refused': dict(tally.refused.most_common()),
         'refused_by_the_tracker': dict(tally.counted.most_common()), 'estimates': tally.estimates,
-        'failures': failures, 'ms_median': round(1e3 * float(np.median(slow)), 3),
-        'ms_p999': round(1e3 * float(slow[int(0.999 * len(slow))]), 1),
-        'ms_most': round(1e3 * float(slow[-1]), 1), 'memory_grown_mb': round(peak - grown, 1),
+        'failures': failures, 'ms_median': round(float(np.median(slow)), 3),
+        'ms_p999': round(float(slow[int(0.999 * len(slow))]), 1),
+        'ms_most': round(float(slow[-1]), 1), 'memory_grown_mb': round(peak - grown, 1),
         'cpu_seconds': round(process_time() - start, 1),
     }  # fmt: skip
 
 
 def parameters(system, draws):
     """Run `draws` extreme configurations."""
-    failures, start, ran, estimates = [], process_time(), 0, 0
+    failures, start, found = [], process_time(), []
     for number in range(draws):
         try:
-            found = run_extreme(system, number)
+            found.append(run_extreme(system, number))
         except Exception as error:
             failures.append(_text_of(error))
-            continue
-        ran += found is not None
-        estimates += found or 0
+    ran = [count for count in found if count is not None]
     return {
-        'draws': draws, 'ran': ran, 'estimates': estimates, 'failures': failures,
+        'draws': draws, 'ran': len(ran), 'estimates': sum(ran), 'failures': failures,
         'cpu_seconds': round(process_time() - start, 1),
     }  # fmt: skip
 
@@ -118,33 +115,24 @@ def main():
             system: pool.submit(_all, system, given.cases, given.draws) for system in given.systems
         }
         files = [pool.submit(file_results, name, given.files) for name in FILES if given.files]
-        shares = [
-            (name, min(AT_ONCE, given.states - first), first)
-            for first in range(0, given.states, AT_ONCE)
-            for name in RECORDED
-        ]
-        files += [pool.submit(state_results, *share) for share in shares]
+        for first, name in itertools.product(range(0, given.states, AT_ONCE), RECORDED):
+            share = min(AT_ONCE, given.states - first)
+            files.append(pool.submit(state_results, name, share, first))
         results = {system: item.result() for system, item in coming.items()}
         damaged = [item.result() for item in files]
-    failed = False
+    failures = []
     for system, result in results.items():
         hostile, extreme = result['messages'], result['parameters']
-        failed = failed or bool(hostile['failures'] or extreme['failures'])
-        print(
-            f'{system}: {hostile["cases"]} messages, {hostile["read"]} read, '
-            f'{hostile["estimates"]} estimates, {len(hostile["failures"])} failures, slowest '
-            f'{hostile["ms_most"]} ms; {extreme["ran"]} configurations, '
-            f'{len(extreme["failures"])} failures'
-        )
-        for failure in hostile['failures'] + extreme['failures']:
-            print(failure)
+        sent = '{cases} messages, {read} read, {estimates} estimates, slowest {ms_most} ms'
+        print(f'{system}: {sent.format(**hostile)}; {extreme["ran"]} configurations')
+        failures += hostile['failures'] + extreme['failures']
     for tried in damaged:
-        failed = failed or bool(tried['failures'])
         print('{name}: {draws} damaged, {used} used, {cpu_seconds} s'.format(**tried))
-        print(*tried['failures'], sep='\n', end='\n' * bool(tried['failures']))
+        failures += tried['failures']
+    print(*failures, sep='\n')
     if given.json:
         given.json.write_text(json.dumps(results, indent=1) + '\n')
-    return int(failed)
+    return int(bool(failures))
 
 
 if __name__ == '__main__':

@@ -118,7 +118,6 @@ def states_damaged(recording, draws, first=0):
     """Read states of a run, damaged in `draws` ways, and go on from those that are taken: how many
     were, and what was wrong. What a tracker raises then the node takes for a damaged state."""
     run = tracked(recording)
-    system = run.system.name
     taken, failures = 0, []
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / 'state'
@@ -127,7 +126,7 @@ def states_damaged(recording, draws, first=0):
         header, arrays = parts_of(path)
         text = json.dumps(header)
         for k in range(first, first + draws):
-            rng = np.random.default_rng(k)
+            rng, wrong = np.random.default_rng(k), []
             if k % 4:
                 forge(path, *forged(text, arrays, rng))
             else:
@@ -137,41 +136,37 @@ def states_damaged(recording, draws, first=0):
                 tracker = tracker_from(read_state(path), run.system, run.config)
                 taken += 1
                 if not k % 4 and path.read_bytes() != good:
-                    failures.append(f'state of {system}, draw {k}: damaged, and taken for good')
+                    wrong.append('damaged, and taken for good')
                 with contextlib.suppress(Exception):
                     for measurement in run.input[CUT : CUT + GOES_ON]:
                         tracker.process(measurement)
             except StateError as error:
                 if '\n' in str(error) or len(str(error)) > MOST_WORDS:
-                    failures.append(f'state of {system}, draw {k}: {str(error)[:100]!r}')
+                    wrong.append(repr(str(error)[:100]))
             except Exception as error:
-                failures.append(f'state of {system}, draw {k}: {type(error).__name__}: {error}')
+                wrong.append(f'{type(error).__name__}: {error}')
             if process_time() - start > LONGEST:
-                failures.append(f'state of {system}, draw {k}: {process_time() - start:.0f} s')
+                wrong.append(f'{process_time() - start:.0f} s')
+            failures += [f'state of {run.system.name}, draw {k}: {each}' for each in wrong]
     return taken, failures
 
 
-FILES = {each.name: (convert_damaged, each) for each in FORMATS if each.kind != 'none'}
+FILES = {each.name: each for each in FORMATS if each.kind != 'none'}
 """What is damaged: each format that is taken in."""
 
 
 def file_results(name, draws):
     """What happened to `draws` damaged files, as plain values."""
-    attempt, what = FILES[name]
-    start = process_time()
-    return _results(name, draws, start, *attempt(what, draws))
+    return _results(name, draws, convert_damaged, FILES[name], draws)
 
 
 def state_results(recording, draws, first):
     """What happened to `draws` states of a run, from the number `first` on."""
-    start = process_time()
     name = f'state of {recording.split("_")[0]}'
-    return _results(name, draws, start, *states_damaged(recording, draws, first))
+    return _results(name, draws, states_damaged, recording, draws, first)
 
 
-def _results(name, draws, start, used, failures):
-    seconds = round(process_time() - start, 1)
-    return {
-        'name': name, 'draws': draws, 'used': used, 'failures': failures[:5],
-        'cpu_seconds': seconds,
-    }  # fmt: skip
+def _results(name, draws, attempt, *arguments):
+    start, (used, failures) = process_time(), attempt(*arguments)
+    found = {'name': name, 'draws': draws, 'used': used, 'failures': failures[:5]}
+    return {**found, 'cpu_seconds': round(process_time() - start, 1)}

@@ -14,7 +14,7 @@ import numpy as np
 
 from msg_adapters.estimates import write_estimate
 
-from .schema import make
+from .streams import make
 
 ROUNDING = 1e-9
 
@@ -38,13 +38,12 @@ def check_numbers(estimate):
     if estimate.state_names == ('depth', 'amplitude') and len(estimate) == 1:
         valid = estimate.extras['existence'] > 0.0  # a row that says that there is no reflector
     state, covariance = estimate.state[valid], estimate.covariance[valid]
-    assert np.isfinite(state).all(), f'state {state}'
-    assert np.isfinite(covariance).all(), f'covariance {covariance}'
+    for name, values in (('state', state), ('covariance', covariance)):
+        assert np.isfinite(values).all(), f'{name} {values}'
     check_covariances(covariance)
     probabilities = estimate.probabilities
     if probabilities.size:
-        assert np.isfinite(probabilities).all(), f'probabilities {probabilities}'
-        assert probabilities.min() >= 0.0 and probabilities.max() <= 1.0, probabilities
+        assert ((probabilities >= 0.0) & (probabilities <= 1.0)).all(), probabilities
         wrong = np.abs(probabilities.sum(axis=1) - 1.0).max()
         assert wrong < ROUNDING, f'probabilities sum to one but for {wrong}'
     for name, column in estimate.extras.items():

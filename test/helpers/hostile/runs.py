@@ -6,8 +6,12 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""A tracker under a stream of good messages with bad ones between them, or with extreme parameters
-that are allowed."""
+"""What is done to good messages, and a tracker under a stream of good ones with bad ones between
+them, or with extreme parameters that are allowed.
+
+Each mutation takes a message, which it may change, and a generator of random numbers; most leave a
+message that gets past the first checks.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +26,258 @@ from hypothesis import strategies as st
 import numpy as np
 
 from msg_adapters.inputs import inputs_of, made_inputs
+from msg_adapters.table import DATATYPES
 from sonar_imm.intake import Intake
 from sonar_imm.measurements import Rejection
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.recordings.measurements import DetectedImages
 
-from .mutations import mutated, MUTATIONS
 from .properties import check_estimate, check_refusal
-from .streams import IMAGES, stream, templates, VARIANTS
+from .streams import (
+    clone,
+    IMAGES,
+    is_bool,
+    is_many,
+    is_sequence,
+    leaves,
+    make,
+    number_type,
+    SECOND,
+    stream,
+    templates,
+    VARIANTS,
+)
+
+ODD = np.array([
+    np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 1.0, 5e-324, 1e-45, 1e-30, 1e-12, 1e-6, 0.5, 3.0,
+    np.pi, 90.0, 360.0, 1e5, 1e12, 1e30, 3e38, 1.7e308, -1e5, -1e30, 2.0**24, 2.0**53,
+])  # fmt: skip
+TEXTS = [
+    '', ' ', 'map', 'other', 'map_ned', '/map', '<script>alert(1)</script>', 'ü' * 200, 'a/b',
+    'a\nb', '\x1b[2J', 'z' * 5000,
+]  # fmt: skip
+_CODES = {name: code for code, name in DATATYPES.items()}
+TABLE = 'sensor_msgs/msg/PointCloud2'
+
+
+def odd_field(message, rng):
+    """An odd value in any field, however deep."""
+    places = list(leaves(message))
+    owner, name, node = places[rng.integers(len(places))]
+    odd = _odd_many if is_many(node) else _odd_one
+    setattr(owner, name, odd(getattr(owner, name), node, rng))
+
+
+def odd_table(message, rng):
+    """Odd numbers, rows or columns in a table; an odd field in what is none."""
+    if message.__msgtype__ != TABLE:
+        return odd_field(message, rng)
+    columns = _columns(message)
+    for _ in range(1 + rng.integers(2)):
+        _COLUMNS[rng.integers(len(_COLUMNS))](columns, rng)
+    _encode(message, columns, rng)
+
+
+def odd_layout(message, rng):
+    """The same table, laid out in another way: byte order, padding, height, order of fields."""
+    if message.__msgtype__ != TABLE:
+        return odd_field(message, rng)
+    _encode(message, _columns(message), rng, strange=True)
+
+
+def claim(message, rng):
+    """A table that claims what it does not hold."""
+    if message.__msgtype__ != TABLE:
+        return odd_field(message, rng)
+    big = int(rng.choice([0, 1, 2, 3, 7, 255, 2**16, 2**24, 2**31 - 1, 2**31, 2**32 - 1]))
+    if rng.random() < 0.4 and message.fields:
+        field = message.fields[rng.integers(len(message.fields))]
+        name = str(rng.choice(['offset', 'count', 'datatype']))
+        setattr(field, name, big % 256 if name == 'datatype' else big)
+    elif rng.random() < 0.3:
+        message.data = message.data[: int(rng.integers(len(message.data) + 1))]
+    else:
+        setattr(message, str(rng.choice(['height', 'width', 'point_step', 'row_step'])), big)
+
+
+def odd_stamp(message, rng):
+    """A stamp that goes back, forward, or nowhere."""
+    stamp = getattr(getattr(message, 'header', None), 'stamp', None)
+    if stamp is None:
+        return odd_field(message, rng)
+    kind = rng.integers(6)
+    if kind == 0:
+        stamp.sec = int(rng.choice([0, 1, -1, -(2**31), 2**31 - 1]))
+    elif kind == 1:
+        stamp.nanosec = int(rng.choice([0, 1, 10**9 - 1, 10**9, 2**32 - 1]))
+    else:
+        most = [9.0, 10.5, 12.0, 17.0][kind - 2]
+        shift = int(rng.choice([-1, 1]) * 10.0 ** rng.uniform(0.0, most))
+        total = min(max(stamp.sec * SECOND + stamp.nanosec + shift, 0), (2**31 - 1) * SECOND)
+        stamp.sec, stamp.nanosec = divmod(total, SECOND)
+
+
+def again(message, rng):
+    """Nothing: the message is sent again, or on another input."""
+
+
+MUTATIONS = (odd_field, odd_table, odd_table, odd_layout, claim, odd_stamp, again)
+
+
+def mutated(message, mutation, rng):
+    """A copy of a message, changed once or twice."""
+    message = clone(message)
+    mutation(message, rng)
+    if rng.random() < 0.3:
+        MUTATIONS[rng.integers(len(MUTATIONS))](message, rng)
+    return message
+
+
+def _odd_one(value, node, rng):
+    number = number_type(node)
+    if number is None:
+        return str(rng.choice(TEXTS))
+    if is_bool(node):
+        return bool(rng.integers(2))
+    if number.kind == 'f':
+        return float(_odd_floats(np.asarray(value, number), rng))
+    low, high = np.iinfo(number).min, np.iinfo(number).max
+    return int(rng.choice([low, high, 0, 1, 2, 3, rng.integers(low, high)]))
+
+
+def _odd_floats(values, rng):
+    """Values like those given, or none at all like them."""
+    with np.errstate(all='ignore'):
+        kind = rng.integers(4)
+        if kind == 0:
+            new = values * 10.0 ** rng.uniform(-40.0, 40.0)
+        elif kind == 1:
+            new = values + rng.normal(size=values.shape) * 10.0 ** rng.uniform(-9.0, 3.0)
+        else:
+            new = rng.choice(ODD, values.shape)
+        return np.asarray(new).astype(values.dtype)
+
+
+def _odd_numbers(values, rng):
+    """An array with odd numbers in some or all places."""
+    where = rng.random(values.shape) < rng.choice([0.1, 0.5, 1.0])
+    if values.dtype.kind == 'f':
+        return np.where(where, _odd_floats(values, rng), values)
+    limits = np.iinfo(values.dtype)
+    new = rng.choice([limits.min, limits.max, 0, 1, 2, 3], values.shape)
+    return np.where(where, new, values).astype(values.dtype)
+
+
+def _odd_many(value, node, rng):
+    if isinstance(value, list):
+        if not is_sequence(node):
+            return value
+        if not value or rng.random() < 0.2:
+            return []
+        picked = rng.integers(len(value), size=int(rng.integers(1, 2 * len(value) + 1)))
+        return [clone(value[i]) for i in picked]
+    if is_sequence(node) and rng.random() < 0.3:
+        length = int(rng.choice([0, 1, max(len(value) - 1, 0), len(value) + 1, 1000]))
+        return np.resize(value, length) if len(value) else np.ones(length, value.dtype)
+    return _odd_numbers(value, rng)
+
+
+# -- tables ---------------------------------------------------------------------------------------
+
+
+def _columns(message):
+    """The columns of a good table; nothing of one that is damaged already."""
+    columns = {}
+    rows = message.height * message.width
+    for each in message.fields:
+        code = DATATYPES.get(each.datatype)
+        if code is None or each.count < 1 or each.count > 5000:
+            continue
+        dtype = np.dtype((np.dtype(code).newbyteorder('<'), (each.count,)))
+        end = each.offset + dtype.itemsize
+        if rows * message.point_step > len(message.data) or end > message.point_step:
+            continue
+        raw = np.asarray(message.data[: rows * message.point_step], 'u1')
+        raw = raw.reshape(rows, message.point_step)[:, each.offset : end]
+        columns[each.name] = np.ascontiguousarray(raw).view(f'<{code}').reshape(rows, each.count)
+    return columns
+
+
+def _one(columns, rng):
+    names = list(columns)
+    return names[rng.integers(len(names))] if names else None
+
+
+def _odd_values(columns, rng):
+    if (name := _one(columns, rng)) is not None:
+        columns[name] = _odd_numbers(columns[name], rng)
+
+
+def _odd_rows(columns, rng):
+    rows = len(next(iter(columns.values()), ()))
+    count = int(rng.choice([0, 1, 2, max(rows - 1, 0), rows, rows + 1, 3 * rows, 400]))
+    if rng.random() < 0.5 and count <= rows:
+        which = np.sort(rng.permutation(rows)[:count])
+    else:
+        which = rng.integers(max(rows, 1), size=count if rows else 0)
+    for name in columns:
+        columns[name] = columns[name][which]
+
+
+def _fewer_columns(columns, rng):
+    if (name := _one(columns, rng)) is not None:
+        column = columns.pop(name)
+        if rng.random() < 0.5:
+            columns[str(rng.choice(TEXTS)) or 'x'] = column
+
+
+def _other_count(columns, rng):
+    if (name := _one(columns, rng)) is not None:
+        count = int(rng.choice([1, 2, 3, 5, 8, 32, 200]))
+        columns[name] = np.resize(columns[name], (len(columns[name]), count))
+
+
+def _other_type(columns, rng):
+    if (name := _one(columns, rng)) is not None:
+        with np.errstate(all='ignore'):
+            kind = str(rng.choice(list(DATATYPES.values())))
+            columns[name] = columns[name].astype(f'<{kind}')
+
+
+_COLUMNS = (
+    _odd_values, _odd_values, _odd_values, _odd_rows, _fewer_columns, _other_count, _other_type,
+)  # fmt: skip
+
+
+def _encode(message, columns, rng, strange=False):
+    """Write columns into a PointCloud2, with padding and byte order as it comes."""
+    strange = strange or rng.random() < 0.2
+    order = '>' if strange and rng.random() < 0.5 else '<'
+    names = list(columns)
+    if strange:
+        rng.shuffle(names)
+    fields, parts, offset = [], [], 0
+    rows = len(next(iter(columns.values()), ()))
+    for name in names:
+        gap = int(rng.integers(5)) if strange else 0
+        column = columns[name].astype(columns[name].dtype.newbyteorder(order))
+        raw = np.ascontiguousarray(column).view('u1').reshape(rows, -1) if rows else None
+        parts += [np.zeros((rows, gap), 'u1'), raw]
+        told = {'datatype': _CODES[column.dtype.str[1:]], 'count': column.shape[1]}
+        fields.append(make('sensor_msgs/msg/PointField', name=name, offset=offset + gap, **told))
+        offset += gap + column.dtype.itemsize * column.shape[1]
+    height = int(rng.choice([h for h in range(1, 5) if rows % h == 0])) if strange else 1
+    table = np.concatenate(parts, axis=1) if rows and parts else np.zeros((rows, 0), 'u1')
+    width, pad = rows // height, int(rng.integers(9)) if strange else 0
+    lines = table.reshape(height, width * table.shape[1]) if height else table
+    lines = np.concatenate([lines, np.zeros((len(lines), pad), 'u1')], axis=1)
+    message.fields, message.is_bigendian = fields, order == '>'
+    message.height, message.width, message.point_step = height, width, offset
+    message.row_step, message.data = lines.shape[1], np.ascontiguousarray(lines).ravel()
+
+
+# -- runs ---------------------------------------------------------------------------------------
 
 BATCH = 50
 """Bad messages in one run of a tracker."""
@@ -192,12 +439,10 @@ def _check_nothing_lost(tracker, kept, estimates):
         if i in (None, REFUSED) or found is estimates[i] is None:
             continue
         assert found is not None and estimates[i] is not None
-        assert len(found) == len(estimates[i])
-        for first, other in zip(found, estimates[i]):
+        for first, other in zip(found, estimates[i], strict=True):
             assert first.stamp_ns == other.stamp_ns
-            np.testing.assert_array_equal(first.state, other.state)
-            np.testing.assert_array_equal(first.covariance, other.covariance)
-            np.testing.assert_array_equal(first.probabilities, other.probabilities)
+            for name in ('state', 'covariance', 'probabilities'):
+                np.testing.assert_array_equal(getattr(first, name), getattr(other, name))
 
 
 def _at(message, stamp_ns):
@@ -280,8 +525,7 @@ def _extreme_number(spec, low, high, rng):
 
 def run_extreme(system, seed):
     """Run one draw over a short stream; gives the number of estimates, None for no draw."""
-    found = extreme_config(system, seed)
-    if found is None:
+    if (found := extreme_config(system, seed)) is None:
         return None
     config, values = found
     tracker = SYSTEMS[system].build(config)

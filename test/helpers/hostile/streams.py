@@ -6,12 +6,18 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Good messages: a short stream for each system, and one message of every input and type."""
+"""Good messages: a short stream for each system, and one message of every input and type.
+
+Messages are trees of plain values, by the definitions of their types: adapters read by attribute
+access only, so that a tree serves as a message. Every leaf keeps to its type: what no wire could
+bring is not tried.
+"""
 
 from __future__ import annotations
 
 from functools import cache
 import math
+from types import SimpleNamespace
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -19,7 +25,84 @@ from rosbags.interfaces import Nodetype
 from msg_adapters.inputs import inputs_of, made_inputs
 from sonar_imm import measurements as m
 
-from .schema import blank, clone, is_many, leaves, make, number_type
+from .. import marine
+
+NUMBERS = {
+    'bool': 'u1', 'byte': 'u1', 'char': 'u1', 'octet': 'u1',
+    'int8': 'i1', 'uint8': 'u1', 'int16': 'i2', 'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4',
+    'int64': 'i8', 'uint64': 'u8', 'float32': 'f4', 'float64': 'f8',
+}  # fmt: skip
+"""The numpy type of each number on the wire."""
+
+
+def fields_of(type_name):
+    """The fields of a message type: (name, node)."""
+    return marine.typestore().fielddefs[type_name][1]
+
+
+def make(type_name, **values):
+    """A message with some fields, the others zero; the factory that writers take."""
+    fields = {name: _zero(node) for name, node in fields_of(type_name)}
+    return SimpleNamespace(**{**fields, **values}, __msgtype__=type_name)
+
+
+def clone(value):
+    """A copy that shares nothing that can change."""
+    if isinstance(value, SimpleNamespace):
+        return SimpleNamespace(**{name: clone(member) for name, member in vars(value).items()})
+    if isinstance(value, list):
+        return [clone(item) for item in value]
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+def leaves(message):
+    """Every place that holds something: (owner, name, node), lists and arrays as one."""
+    for name, node in fields_of(message.__msgtype__):
+        kind, detail = node
+        if kind == Nodetype.NAME:
+            yield from leaves(getattr(message, name))
+            continue
+        yield message, name, node
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and detail[0][0] == Nodetype.NAME:
+            for item in getattr(message, name)[:3]:
+                yield from leaves(item)
+
+
+def number_type(node):
+    """The numpy type of a leaf or of its elements; None for text and for messages."""
+    kind, detail = node
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return number_type(detail[0])
+    return np.dtype(NUMBERS[detail[0]]) if kind == Nodetype.BASE and detail[0] in NUMBERS else None
+
+
+def is_many(node):
+    return node[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+
+
+def is_sequence(node):
+    return node[0] == Nodetype.SEQUENCE
+
+
+def is_bool(node):
+    return node[0] == Nodetype.BASE and node[1][0] == 'bool'
+
+
+def _zero(node):
+    kind, detail = node
+    if kind == Nodetype.NAME:
+        return make(detail)
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        inner, count = detail
+        length = count if kind == Nodetype.ARRAY else 0
+        number = number_type(inner)
+        if number is not None:
+            return np.zeros(length, number)
+        return [_zero(inner) for _ in range(length)]
+    if detail[0] in NUMBERS:
+        return False if detail[0] == 'bool' else np.zeros((), NUMBERS[detail[0]]).item()
+    return ''
+
 
 T0 = 1_700_000_000 * 10**9
 SECOND = 10**9
@@ -190,12 +273,9 @@ def templates(system):
         for type_name in entry.readers:
             if (entry.name, type_name) in found:
                 continue
-            table = type_name.endswith('PointCloud2')
-            message = (
-                clone(next(item for (_, kind), item in found.items() if kind == type_name))
-                if table
-                else plausible(type_name)
-            )
+            message = plausible(type_name)
+            if type_name.endswith('PointCloud2'):  # any table
+                message = clone(next(m for (_, kind), m in found.items() if kind == type_name))
             if hasattr(message, 'header'):
                 message.header.frame_id = FRAMES.get((system, entry.name), 'map')
             found[entry.name, type_name] = message
@@ -240,10 +320,9 @@ _FIELDS = {
 
 def plausible(type_name):
     """A message in which no number is odd."""
-    message = blank(type_name)
+    message = make(type_name)
     _fill(message)
-    for name, value in SPECIAL.get(type_name, {}).items():
-        setattr(message, name, value)
+    vars(message).update(SPECIAL.get(type_name, {}))
     return message
 
 

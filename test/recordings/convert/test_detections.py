@@ -8,6 +8,8 @@
 
 """Receivers with clocks of their own, compared by tags that lie at known places."""
 
+import shutil
+
 from helpers.field_files import measured, text_of
 import numpy as np
 import pytest
@@ -60,13 +62,10 @@ def detect(rng, tag, T, place, echoes, receivers):
     return found
 
 
-def received_of(rows):
-    return Received(*(np.array(column, np.int64) for column in zip(*rows)))
-
-
 def compared(rows):
     places = np.vstack([SYNC, np.full((1, 3), np.nan)])
-    return compare_clocks(received_of(rows), RECEIVERS, places, SPEED, 6 * 3600.0)
+    received = Received(*(np.array(column, np.int64) for column in zip(*rows)))
+    return compare_clocks(received, RECEIVERS, places, SPEED, 6 * 3600.0)
 
 
 @pytest.mark.parametrize('seed, echoes', [(0, 0.0), (1, 0.05), (2, 0.05)])
@@ -103,23 +102,23 @@ def test_pings_hold_each_receiver_once_and_are_no_longer_than_the_window():
     assert (np.diff(begins) > 0.7 * SECOND).all()  # nothing of a ping begins the next one
 
 
+def write_csv(path, head, rows):
+    path.write_text('\n'.join([head, *(','.join(map(str, row)) for row in rows)]) + '\n')
+    return path
+
+
 def converted(folder, rows, **options):
     names = ('S1', 'S2', 'A69-1601-7')
-    lines = ['Date and Time (UTC),Receiver,Transmitter,Sensor Value']
-    for receiver, tag, stamp in rows:
-        time = str(np.datetime64(stamp, 'ns').astype('datetime64[us]')).replace('T', ' ')
-        lines.append(f'{time},r{receiver},{names[tag]},')
-    (folder / 'vue.csv').write_text('\n'.join(lines) + '\n')
-    for name, head, places in (
-        ('stations', 'receiver', {f'r{k}': place for k, place in enumerate(RECEIVERS)}),
-        ('sync', 'tag', dict(zip(names, SYNC))),
-    ):
-        lines = [f'{label},{x},{y},{z}' for label, (x, y, z) in places.items()]
-        (folder / f'{name}.csv').write_text(f'{head},x,y,z\n' + '\n'.join(lines) + '\n')
-    options = {'sync': folder / 'sync.csv', 'sound_speed': SPEED, **options}
-    return convert_detections(
-        folder / 'vue.csv', folder / 'out', receivers=folder / 'stations.csv', **options
-    )
+    times = [str(np.datetime64(stamp // 1000, 'us')).replace('T', ' ') for *_, stamp in rows]
+    rows = [(t, f'r{receiver}', names[tag], '') for t, (receiver, tag, _) in zip(times, rows)]
+    head = 'Date and Time (UTC),Receiver,Transmitter,Sensor Value'
+    vue = write_csv(folder / 'vue.csv', head, rows)
+    places = [(f'r{k}', *place) for k, place in enumerate(RECEIVERS)]
+    stations = write_csv(folder / 'stations.csv', 'receiver,x,y,z', places)
+    fixed = [(name, *place) for name, place in zip(names, SYNC)]
+    sync = write_csv(folder / 'sync.csv', 'tag,x,y,z', fixed)
+    options = {'sync': sync, 'sound_speed': SPEED, **options}
+    return convert_detections(vue, folder / 'out', receivers=stations, **options)
 
 
 def test_arrivals_of_a_tag_fit_the_place_it_had(tmp_path):
@@ -137,32 +136,23 @@ def test_arrivals_of_a_tag_fit_the_place_it_had(tmp_path):
     assert np.std(error) < 1.1 * ERROR
 
 
-def test_without_fixed_tags_the_clocks_are_believed(tmp_path):
+def test_without_fixed_tags_the_clocks_are_believed_and_only_those_are_one_sentence(tmp_path):
     rows, _ = recorded(3)
     report = converted(tmp_path, rows, sync=None, window=0.5)
     assert 'clocks' not in report.notes
     # Clocks that are seconds apart: nobody hears a ping together.
     assert max(len(ping.toa) for ping in measured(report.path)) < 3
-
-
-def test_only_fixed_tags_is_one_sentence(tmp_path):
-    rows = [row for row in recorded(5)[0] if row[1] < 2]
     with pytest.raises(BagError, match='no tag beside the fixed ones'):
-        converted(tmp_path, rows)
+        converted(tmp_path, [row for row in rows if row[1] < 2])
 
 
-@pytest.mark.parametrize(
-    'row', ['x,r1,T', '2024-05-31 10:00:00,nobody,T', '2024-05-31,r1,T', '2024-05-31 10:00:00,r1,']
-)
-def test_bad_rows_are_counted(tmp_path, row):
-    (tmp_path / 'stations.csv').write_text('receiver,x,y\nr1,0,0\nr2,9,0\n')
-    (tmp_path / 'd.csv').write_text(
-        f'time_utc,receiver,tag\n2024-05-31 10:00:00,r1,T\n{row}\n2024-05-31 10:00:01,r2,T\n'
-    )
-    report = convert_detections(
-        tmp_path / 'd.csv', tmp_path / 'out', receivers=tmp_path / 'stations.csv'
-    )
-    assert report.bad_rows == 1 and report.messages == {'/arrivals': 1}
+def test_bad_rows_are_counted(tmp_path):
+    bad = ['x,r1,T', '2024-05-31 10:00:00,nobody,T', '2024-05-31,r1,T', '2024-05-31 10:00:00,r1,']
+    rows = [[row] for row in ('2024-05-31 10:00:00,r1,T', *bad, '2024-05-31 10:00:01,r2,T')]
+    table = write_csv(tmp_path / 'd.csv', 'time_utc,receiver,tag', rows)
+    stations = write_csv(tmp_path / 's.csv', 'receiver,x,y', [('r1', 0, 0), ('r2', 9, 0)])
+    report = convert_detections(table, tmp_path / 'out', receivers=stations)
+    assert report.bad_rows == 4 and report.messages == {'/arrivals': 1}
 
 
 STATIONS = {'VR2-101': (0, 0), 'VR2-102': (240, 0), 'VR2-103': (240, 240), 'VR2-104': (0, 240)}
@@ -179,20 +169,19 @@ def heard(period=30.0, pings=20):
 
 
 def exported(folder, head, line, rows=None, **options):
-    lines = [line(t, name) for t, name in rows or heard()]
-    (folder / 'export.csv').write_text('\n'.join([head, *lines]) + '\n')
-    places = [f'{name},{x},{y},-3' for name, (x, y) in STATIONS.items()]
-    (folder / 'stations.csv').write_text('receiver,x,y,z\n' + '\n'.join(places) + '\n')
-    table = CsvOptions(time_zone='UTC', columns=options.pop('columns', {}))
-    paths = folder / 'export.csv', folder / 'out'
-    return convert_detections(*paths, receivers=folder / 'stations.csv', options=table, **options)
+    lines = [[line(t, name)] for t, name in rows or heard()]
+    export = write_csv(folder / 'export.csv', head, lines)
+    places = [(name, x, y, -3) for name, (x, y) in STATIONS.items()]
+    stations = write_csv(folder / 'stations.csv', 'receiver,x,y,z', places)
+    options |= {'receivers': stations, 'options': CsvOptions(time_zone='UTC')}
+    return convert_detections(export, folder / 'out', **options)
 
 
 VUE = 'Date and Time (UTC),Receiver,Transmitter'
 
 
-def of_vue(t, r):
-    return f'{text_of(t, 6)},{r},7'
+def of_vue(t, r, digits=6):
+    return f'{text_of(t, digits)},{r},7'
 
 
 VDAT = (
@@ -237,55 +226,47 @@ def test_exports_of_makers_and_networks(tmp_path, head, line):
     assert sniff(tmp_path / 'export.csv').kind == 'detections'
 
 
-def test_detections_that_are_marked_as_invalid_are_left_out(tmp_path):
-    head = 'Timestamp,Receiver,Transmitter,Valid'
-    report = exported(
-        tmp_path, head, lambda t, r: f'{text_of(t, 6)},{r},7,{str(r != "VR2-101").upper()}'
-    )
-    assert report.bad_rows == 20 and set(measured(report.path)[0].rx_id) == {2, 3, 4}
-
-
-@pytest.mark.parametrize(
-    'digits, std, words',
-    [(0, None, '1 s, 1.5e+03 m'), (1, 0.1, '0.1 s, 150 m'), (2, 0.01, '0.01 s'), (6, None, '')],
-)
-def test_the_resolution_of_stamps_is_said_and_heeded(tmp_path, digits, std, words):
-    args = tmp_path, VUE, lambda t, r: f'{text_of(t, digits)},{r},7'
-    if digits == 0:
-        with pytest.raises(BagError) as caught:
-            exported(*args)
-        assert words in caught.value.sentence and '--toa-std 0.29' in caught.value.sentence
-        assert exported(*args, toa_std=0.29).messages == {'/arrivals': 20}
-        return
-    report = exported(*args)
-    assert words in report.notes.get('resolution', '')
-    var = measured(report.path)[0].var_toa
-    assert var == pytest.approx(std**2 / 12) if std else np.isnan(var).all()
-
-
-def test_days_of_five_digits_have_a_resolution_too(tmp_path):
-    def line(t, r):
-        return f'{t / 86400 + 25569:.5f},{r},7'
-
-    with pytest.raises(BagError, match='a resolution of 0.864 s'):
-        exported(tmp_path, 'excel_time,Receiver,Transmitter', line)
-
-
-@pytest.mark.parametrize('period, words', [(0.7, '0.35 s'), (1.0, '0.5 s'), (30.0, '')])
-def test_pings_within_a_second_are_not_joined(tmp_path, period, words):
-    report = exported(tmp_path, VUE, of_vue, heard(period))
-    assert report.messages == {'/arrivals': 20} and words in report.notes.get('window', '')
-
-
-def test_pings_faster_than_sound_crosses_the_array_are_a_question(tmp_path):
+def test_pings_within_a_second_are_not_joined(tmp_path):
+    for period, words in ((0.7, '0.35 s'), (1.0, '0.5 s'), (30.0, '')):
+        report = exported(tmp_path, VUE, of_vue, heard(period))
+        assert report.messages == {'/arrivals': 20} and words in report.notes.get('window', '')
+        shutil.rmtree(tmp_path / 'out')
+    # Those faster than sound crosses the array, and one receiver alone, are questions.
     with pytest.raises(BagError, match='each 0.2 s, and sound takes 0.226 s.*--window 0.23'):
         exported(tmp_path, VUE, of_vue, heard(0.2))
     assert exported(tmp_path, VUE, of_vue, heard(0.2), window=0.23).messages
-
-
-def test_one_receiver_alone_is_said(tmp_path):
+    shutil.rmtree(tmp_path / 'out')
     report = exported(tmp_path, VUE, of_vue, [row for row in heard() if row[1] == 'VR2-101'])
     assert 'all detections are of VR2-101' in report.questions[0]
+    shutil.rmtree(tmp_path / 'out')
+
+    def marked(t, r):
+        return f'{of_vue(t, r)},{"FALSE" if r == "VR2-101" else "TRUE"}'
+
+    # Detections that are marked as invalid are left out.
+    report = exported(tmp_path, 'Timestamp,Receiver,Transmitter,Valid', marked)
+    assert report.bad_rows == 20 and set(measured(report.path)[0].rx_id) == {2, 3, 4}
+
+
+def test_the_resolution_of_stamps_is_said_and_heeded(tmp_path):
+    whole = tmp_path, VUE, lambda t, r: of_vue(t, r, 0)
+    with pytest.raises(BagError) as caught:
+        exported(*whole)
+    assert '1 s, 1.5e+03 m' in caught.value.sentence and '--toa-std 0.29' in caught.value.sentence
+    assert exported(*whole, toa_std=0.29).messages == {'/arrivals': 20}
+    for digits, std, words in ((1, 0.1, '0.1 s, 150 m'), (2, 0.01, '0.01 s'), (6, None, '')):
+        shutil.rmtree(tmp_path / 'out')
+        report = exported(tmp_path, VUE, lambda t, r, digits=digits: of_vue(t, r, digits))
+        assert words in report.notes.get('resolution', '')
+        var = measured(report.path)[0].var_toa
+        assert var == pytest.approx(std**2 / 12) if std else np.isnan(var).all()
+
+    # Days of five digits have one too.
+    def days(t, r):
+        return f'{t / 86400 + 25569:.5f},{r},7'
+
+    with pytest.raises(BagError, match='a resolution of 0.864 s'):
+        exported(tmp_path, 'excel_time,Receiver,Transmitter', days)
 
 
 # -- tables of arrival times
@@ -302,23 +283,21 @@ def arrivals(tmp_path):
                 (tmp_path / f'{name}.csv').write_text(content)
         if transmitters is not None:
             options['transmitters'] = tmp_path / 'tx.csv'
-        return convert_arrivals(
-            tmp_path / 'in.csv', tmp_path / 'out', receivers=tmp_path / 'rx.csv', **options
-        )
+        options['receivers'] = tmp_path / 'rx.csv'
+        return convert_arrivals(tmp_path / 'in.csv', tmp_path / 'out', **options)
 
     return run
 
 
 def test_one_way_arrivals_are_stamped_with_the_earliest(arrivals):
-    report = arrivals(
-        'ping,receiver,arrival_s\n7,1,100.250\n8,0,105\n7,0,100.125\n', toa_std=0.001
-    )
+    rows = '7,1,100.250\n8,0,105\n7,0,100.125\n'
+    report = arrivals(f'ping,receiver,arrival_s\n{rows}', toa_std=0.001)
     first, second = measured(report.path)
     assert first.stamp_ns == 100_125_000_000 and first.passive
     assert first.rx_id.tolist() == [1, 0] and first.toa.tolist() == [0.125, 0.0]
     assert first.rx.tolist() == [[10, 0, -2], [0, 0, -1]]
     assert first.var_toa == pytest.approx([1e-6, 1e-6]) and np.isnan(first.bearing).all()
-    assert len(second) == 1 and second.stamp_ns == 105 * 10**9
+    assert len(second) == 1 and second.stamp_ns == 105 * SECOND
     assert 'earliest arrival' in report.notes['emission']
 
 
@@ -338,27 +317,21 @@ def test_travel_times_from_transmitters(arrivals):
     assert np.isnan(first.bearing[1])
 
 
-def test_transmitters_may_be_among_the_receivers(arrivals):
-    (ping,) = measured(arrivals('stamp,transmitter,receiver,toa\n5,2,1,0.1\n').path)
-    assert ping.tx.tolist() == [[0, 20, -3]] and ping.tx_id.tolist() == [2]
-
-
-def test_elevation_and_the_depth_a_diver_reports_are_kept(arrivals):
+def test_elevation_and_depth_are_kept_and_transmitters_may_be_among_the_receivers(arrivals):
     report = arrivals(
         'stamp,transmitter,receiver,toa,elevation,std_elevation,depth,std_depth\n'
         '5,2,1,0.1,-0.2,0.01,11.5,0.2\n'
     )
     (ping,) = measured(report.path)
+    assert ping.tx.tolist() == [[0, 20, -3]] and ping.tx_id.tolist() == [2]
     assert ping.elevation.tolist() == [-0.2] and ping.depth.tolist() == [11.5]
     assert ping.var_elevation[0] == pytest.approx(1e-4)
     assert ping.var_depth[0] == pytest.approx(0.04)
 
 
 def test_bad_rows_are_named(arrivals):
-    report = arrivals(
-        'ping,receiver,arrival\n1,0,5\n1,9,5\n,0,5\n1,1,x\n',
-        receivers=THREE + '2,5,5,5\n,1,1,1\n3,x,1,1\n',
-    )
+    stations = THREE + '2,5,5,5\n,1,1,1\n3,x,1,1\n'
+    report = arrivals('ping,receiver,arrival\n1,0,5\n1,9,5\n,0,5\n1,1,x\n', stations)
     assert report.bad_rows == 6 and len(measured(report.path)) == 1
     text = ' / '.join(report.problems)
     for words in (
@@ -372,39 +345,41 @@ def test_bad_rows_are_named(arrivals):
         assert words in text
 
 
-def test_named_receivers_are_numbered_and_told(arrivals):
-    report = arrivals(
-        'ping,receiver,arrival\n1,north,5\n1,south,6\n',
-        receivers='name,x,y\nsouth,0,0\nnorth,0,9\n',
-    )
-    assert measured(report.path)[0].rx_id.tolist() == [2, 1]
+def test_names_of_receivers_and_tags_are_numbered_and_told(arrivals):
+    stations = 'name,x,y\nsouth,0,0\nnorth,0,9\n'
+    rows = [
+        f'{ping},{tag},{receiver},{100 + ping + 0.01 * k}'
+        for ping in (1, 2)
+        for tag in ('amy', 'bob')
+        for k, receiver in enumerate(('north', 'south'))
+    ]
+    report = arrivals('\n'.join(['ping,tag,receiver,arrival', *rows]) + '\n', stations)
+    assert report.messages == {'/arrivals': 4}
     assert report.notes['receivers'] == 'south = 1, north = 2'
+    assert report.notes['tag'] == 'amy is 1, bob is 2'
+    pings = measured(report.path)
+    assert sorted(ping.tx_id.tolist() for ping in pings) == [[1, 1], [1, 1], [2, 2], [2, 2]]
+    assert all(ping.passive and ping.rx_id.tolist() == [2, 1] for ping in pings)
 
 
-@pytest.mark.parametrize(
-    'text, receivers, words',
-    [
+def test_files_of_another_kind_are_explained(arrivals):
+    usual = 'ping,receiver,arrival\n'
+    for text, receivers, words in (
         ('a,b\n', THREE, 'no column for receiver'),
         ('receiver,foo\n', THREE, 'no column for ping and arrival'),
         ('transmitter,receiver,toa\n', THREE, 'no column for stamp'),
-        ('ping,receiver,arrival\n', 'receiver,x\n', 'no column for y'),
-        ('ping,receiver,arrival\n', 'receiver,x,y\n', 'lists no receiver'),
-        ('ping,receiver,arrival\n', THREE, 'nothing that could be converted'),
-    ],
-)
-def test_files_of_another_kind_are_explained(arrivals, text, receivers, words):
-    with pytest.raises(BagError, match=words):
-        arrivals(text, receivers)
+        (usual, 'receiver,x\n', 'no column for y'),
+        (usual, 'receiver,x,y\n', 'lists no receiver'),
+        (usual, THREE, 'nothing that could be converted'),
+    ):
+        with pytest.raises(BagError, match=words):
+            arrivals(text, receivers)
 
 
 def test_the_real_arrivals_lead_back_to_the_fixes(real_data, tmp_path):
     folder = real_data / 'yaps_ssu1'
-    report = convert_arrivals(
-        folder / 'arrivals.csv',
-        tmp_path / 'bag',
-        receivers=folder / 'receivers.csv',
-        truth=folder / 'gps_truth.csv',
-    )
+    beside = {'receivers': folder / 'receivers.csv', 'truth': folder / 'gps_truth.csv'}
+    report = convert_arrivals(folder / 'arrivals.csv', tmp_path / 'bag', **beside)
     assert report.messages == {'/arrivals': 123, '/truth/estimate': 450} and not report.bad_rows
     pings = measured(report.path)
     assert sum(len(ping) for ping in pings) == 2008 and all(ping.passive for ping in pings)
@@ -417,18 +392,3 @@ def test_the_real_arrivals_lead_back_to_the_fixes(real_data, tmp_path):
 
     solved = least_squares(residuals, [80.0, -80.0, 0.0], loss='soft_l1', f_scale=1e-3).x
     assert np.hypot(*(solved[:2] - fixes[5, 1:3])) < 1.0  # the fixes are another robust solution
-
-
-def test_a_tag_that_is_named_keeps_its_number(arrivals):
-    rows = [
-        f'{ping},{tag},{receiver},{100 + ping + 0.01 * receiver}'
-        for ping in (1, 2)
-        for tag in ('amy', 'bob')
-        for receiver in (0, 1, 2)
-    ]
-    report = arrivals('\n'.join(['ping,tag,receiver,arrival', *rows]) + '\n')
-    assert report.messages == {'/arrivals': 4}
-    assert report.notes['tag'] == 'amy is 1, bob is 2'
-    pings = measured(report.path)
-    assert sorted(ping.tx_id[0] for ping in pings) == [1, 1, 2, 2]
-    assert all(ping.passive and len(set(ping.tx_id.tolist())) == 1 for ping in pings)

@@ -15,6 +15,7 @@ import shutil
 import struct
 from xml.etree import ElementTree
 
+from helpers.commands import run as command
 from helpers.dive_bags import write_dive
 from helpers.sonar_files import write_segy
 import numpy as np
@@ -26,16 +27,10 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import PLACES
 from sonar_imm.measurements import Navigation
 from sonar_imm.soundings import COLUMNS
-from sonar_imm_tools.cli import main
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.recordings.convert import convert_segy
-from sonar_imm_tools.recordings.export.points import (
-    origin_of,
-    Points,
-    read_points,
-    write_las,
-    write_xyz,
-)
+from sonar_imm_tools.recordings.export import points as clouds
+from sonar_imm_tools.recordings.export.points import origin_of, Points, read_points
 from sonar_imm_tools.recordings.export.tracks import tracks_of
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.positions import read_positions
@@ -53,7 +48,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp('tracks')
     write_dive(folder / 'bag', count=COUNT)
     origin = f'--set=origin=[{ORIGIN[0]}, {ORIGIN[1]}, 0.0]'
-    assert main(['track', str(folder / 'bag'), str(folder / 'run'), origin]) == 0
+    assert command('track', folder / 'bag', folder / 'run', origin) == 0
     return folder / 'run'
 
 
@@ -62,31 +57,36 @@ def estimates(run):
     return RunFolder(run).read_estimates()
 
 
+def rows_of(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
 def exported(run, path, *more):
-    assert main(['export', str(run), str(path), *more]) == 0
+    assert command('export', run, path, *more) == 0
     return path
 
 
 def test_rows_are_those_of_confirmed_tracks(run, estimates, tmp_path):
-    with exported(run, tmp_path / 'a.csv').open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(exported(run, tmp_path / 'a.csv'))
     tables = [(e.stamp_ns, e.columns()) for e in estimates]
     kept = [(stamp, columns) for stamp, columns in tables if columns['track_state'][0] > 0]
     assert 0 < len(rows) == len(kept) < COUNT  # the first ones are tentative
     for row, (stamp, columns) in zip(rows, kept):
+        columns = {name: column[0] for name, column in columns.items()}
         assert int(row['stamp_ns']) == stamp
-        P = np.array([columns[f'cov_{name}'][0] for name in COVARIANCE]).reshape(2, 2)
+        P = np.array([columns[f'cov_{name}'] for name in COVARIANCE]).reshape(2, 2)
         major, minor = float(row['std_major']), float(row['std_minor'])
         assert major >= minor
         assert [minor**2, major**2] == pytest.approx(np.linalg.eigvalsh(P), rel=2e-3, abs=2e-3)
         azimuth = math.radians(float(row['major_azimuth_deg']))
         along = np.array([math.sin(azimuth), math.cos(azimuth)])
         assert along @ P @ along == pytest.approx(major**2, rel=2e-3, abs=2e-3)
-        speed = math.hypot(columns['vx'][0], columns['vy'][0])
+        speed = math.hypot(columns['vx'], columns['vy'])
         assert float(row['speed']) == pytest.approx(speed, abs=6e-4)
-        families = {name: columns[name][0] for name in columns if name.startswith('family_')}
+        families = {name: columns[name] for name in columns if name.startswith('family_')}
         assert row['model'] == max(families, key=families.get).removeprefix('family_')
-        place = pymap3d.enu2geodetic(columns['px'][0], columns['py'][0], 0.0, *ORIGIN, 0.0)
+        place = pymap3d.enu2geodetic(columns['px'], columns['py'], 0.0, *ORIGIN, 0.0)
         found = [float(row['latitude']), float(row['longitude'])]
         assert found == pytest.approx(place[:2], abs=3e-8)
 
@@ -110,9 +110,8 @@ def places_of(path):
 
 
 @pytest.mark.parametrize('kind', ['gpx', 'kml', 'geojson', 'parquet'])
-def test_other_formats_hold_the_same_rows(run, tmp_path, kind):
-    with exported(run, tmp_path / 'a.csv').open() as file:
-        rows = list(csv.DictReader(file))
+def test_other_formats_hold_the_same_rows_and_come_in_again(run, tmp_path, kind, capsys):
+    rows = rows_of(exported(run, tmp_path / 'a.csv'))
     path = exported(run, tmp_path / f'a.{kind}')
     wanted = [[float(row['latitude']), float(row['longitude'])] for row in rows]
     if kind == 'parquet':
@@ -125,53 +124,29 @@ def test_other_formats_hold_the_same_rows(run, tmp_path, kind):
         places, times = places_of(path)
     assert np.array(places) == pytest.approx(np.array(wanted), abs=2e-8)
     assert times == [row['time_utc'] for row in rows]
-
-
-@pytest.mark.parametrize('kind', ['gpx', 'kml', 'geojson'])
-def test_exported_tracks_come_in_again(run, tmp_path, kind, capsys):
-    """What `export` writes, `convert` reads, each point once."""
-    path = exported(run, tmp_path / f'a.{kind}')
-    count = len(places_of(path)[0])
-    assert main(['convert', 'truth', str(path), str(tmp_path / 'truth')]) == 0
-    capsys.readouterr()
-    assert main(['convert', str(path), str(tmp_path / 'again')]) == 0
-    assert f'{count} on /fix' in capsys.readouterr().out
+    if kind != 'parquet':  # what `export` writes, `convert` reads, each point once
+        assert command('convert', 'truth', path, tmp_path / 'truth') == 0
+        capsys.readouterr()
+        assert command('convert', path, tmp_path / 'again') == 0
+        assert f'{len(places)} on /fix' in capsys.readouterr().out
 
 
 def test_gis_programs_see_the_lines_of_kml(run, tmp_path):
     pyogrio = pytest.importorskip('pyogrio')
-    path = exported(run, tmp_path / 'a.kml')
-    _, _, geometry, _ = pyogrio.raw.read(path)
+    _, _, geometry, _ = pyogrio.raw.read(exported(run, tmp_path / 'a.kml'))
     kinds = [int.from_bytes(each[1:5], 'little' if each[0] else 'big') for each in geometry]
     assert 2 in [kind & 0xFF for kind in kinds]  # a line string in WKB
 
 
-@pytest.mark.parametrize('name, layer', [('a.gpx', 'track_points'), ('a.geojson', None)])
-def test_gdal_reads_the_places_that_were_written(run, tmp_path, name, layer):
-    pyogrio = pytest.importorskip('pyogrio')
-    path = exported(run, tmp_path / name)
-    _, _, geometry, _ = pyogrio.raw.read(path, layer=layer)
-    points = [each for each in geometry if each[1] & 0xFF == 1]
-    there = np.array([struct.unpack('<2d', each[5:21]) for each in points])
-    table = exported(run, tmp_path / 'a.csv')
-    with table.open() as file:
-        rows = [(float(row['longitude']), float(row['latitude'])) for row in csv.DictReader(file)]
-    assert there == pytest.approx(np.array(rows), abs=1e-8)
-
-
-def test_a_place_on_earth_can_be_told(run, tmp_path):
-    plain = tmp_path / 'plain'
+def test_a_place_on_earth_can_be_told(estimates, tmp_path):
     write_dive(tmp_path / 'bag', count=COUNT)
-    assert main(['track', str(tmp_path / 'bag'), str(plain)]) == 0
-    assert main(['export', str(plain), str(tmp_path / 'a.gpx')]) == 2
+    assert command('track', tmp_path / 'bag', tmp_path / 'plain') == 0
+    assert command('export', tmp_path / 'plain', tmp_path / 'a.gpx') == 2
     assert not (tmp_path / 'a.gpx').exists()
-    path = exported(plain, tmp_path / 'b.gpx', '--epsg', '32632', '--origin', '500000,6000000')
-    places, _ = places_of(path)
+    place = '--epsg', 32632, '--origin', '500000,6000000'
+    places, _ = places_of(exported(tmp_path / 'plain', tmp_path / 'b.gpx', *place))
     # The middle meridian of zone 32, and the northing of some 54.1 degrees.
     assert np.abs(np.array(places) - [54.147, 9.0]).max() < 0.01
-
-
-def test_what_has_no_tracks_is_one_sentence(estimates):
     with pytest.raises(BagError, match='no confirmed tracks'):
         tracks_of(estimates[:1], None)
 
@@ -182,8 +157,8 @@ def points(n=300, seed=2):
     columns['x'], columns['y'] = rng.uniform(-5.0, 20.0, n), rng.uniform(3.0, 13.0, n)
     columns['z'] = -20.0 + 0.1 * columns['x']
     columns['vertical_uncertainty'] = rng.uniform(0.01, 0.04, n)
-    columns['label'] = rng.integers(0, 2, n).astype(float)
-    columns['side'] = rng.integers(0, 2, n).astype(float)
+    for name in ('label', 'side'):
+        columns[name] = rng.integers(0, 2, n).astype(float)
     columns['intensity'] = rng.uniform(-30.0, 20.0, n)
     stamps = 1_700_000_000_000_000_000 + 1_000_000_000 * rng.integers(0, 10, n)
     return Points(stamps, columns)
@@ -191,61 +166,55 @@ def points(n=300, seed=2):
 
 def test_xyz_is_read_by_numpy(tmp_path):
     item = points()
-    write_xyz(tmp_path / 'a.xyz', item)
+    clouds.write_xyz(tmp_path / 'a.xyz', item)
+    wanted = [*(item[name] for name in 'xyz'), np.sqrt(item['vertical_uncertainty'])]
     table = np.loadtxt(tmp_path / 'a.xyz')
-    for k, name in enumerate('xyz'):
-        assert table[:, k] == pytest.approx(item[name], abs=5.1e-4)
-    assert table[:, 3] == pytest.approx(np.sqrt(item['vertical_uncertainty']), abs=5.1e-4)
+    assert table[:, :4] == pytest.approx(np.transpose(wanted), abs=5.1e-4)
 
 
-@pytest.mark.parametrize('name', ['a.las', 'a.laz'])
-def test_las_is_read_by_laspy(tmp_path, name):
+def test_las_is_read_by_laspy(tmp_path):
     laspy = pytest.importorskip('laspy')
     item = points().moved((500_000.0, 6_000_000.0, 0.0))
-    write_las(tmp_path / name, item, 32632)
-    las = laspy.read(tmp_path / name)
-    for axis in 'xyz':
-        assert np.asarray(las[axis]) == pytest.approx(item[axis], abs=5.1e-4)
-    for extra in ('vertical_uncertainty', 'horizontal_uncertainty', 'beam_angle', 'range'):
-        assert np.asarray(las[extra]) == pytest.approx(item[extra].astype(np.float32))
-    assert np.asarray(las.user_data) == pytest.approx(item['label'])
-    assert np.asarray(las.point_source_id) == pytest.approx(item['side'])
-    decibels = np.asarray(las.intensity) / 100.0 + item['intensity'].min()
-    assert decibels == pytest.approx(item['intensity'], abs=0.0051)
-    assert set(las.classification) == {40}
-    wkt = [vlr for vlr in las.header.vlrs if 'Wkt' in type(vlr).__name__]
-    assert 'UTM zone 32N' in wkt[0].string and las.header.global_encoding.wkt
-    if name.endswith('laz'):
-        write_las(tmp_path / 'b.las', item, 32632)
-        assert (tmp_path / name).stat().st_size < (tmp_path / 'b.las').stat().st_size
+    for name in ('a.las', 'a.laz'):
+        clouds.write_las(tmp_path / name, item, 32632)
+        las = laspy.read(tmp_path / name)
+        for axis in 'xyz':
+            assert np.asarray(las[axis]) == pytest.approx(item[axis], abs=5.1e-4)
+        for extra in ('vertical_uncertainty', 'horizontal_uncertainty', 'beam_angle', 'range'):
+            assert np.asarray(las[extra]) == pytest.approx(item[extra].astype(np.float32))
+        assert np.asarray(las.user_data) == pytest.approx(item['label'])
+        assert np.asarray(las.point_source_id) == pytest.approx(item['side'])
+        decibels = np.asarray(las.intensity) / 100.0 + item['intensity'].min()
+        assert decibels == pytest.approx(item['intensity'], abs=0.0051)
+        assert set(las.classification) == {40}
+        wkt = [vlr for vlr in las.header.vlrs if 'Wkt' in type(vlr).__name__]
+        assert 'UTM zone 32N' in wkt[0].string and las.header.global_encoding.wkt
+    assert (tmp_path / 'a.laz').stat().st_size < (tmp_path / 'a.las').stat().st_size
 
 
-@pytest.mark.parametrize(
-    'text, word',
-    [
+def test_broken_tables_are_refused(tmp_path):
+    path, head = tmp_path / 'soundings.csv', ','.join(['stamp_ns', *COLUMNS])
+    for text, words in (
         ('stamp_ns,x,y\n', 'no column z and'),
-        (','.join(['stamp_ns', *COLUMNS]) + '\n1,2\n', 'not numbers'),
-        (','.join(['stamp_ns', *COLUMNS]) + '\n' + ','.join(['a'] * 12) + '\n', 'not numbers'),
-    ],
-)
-def test_broken_tables_are_refused(tmp_path, text, word):
-    path = tmp_path / 'soundings.csv'
-    path.write_text(text)
-    with pytest.raises(BagError, match=word):
-        read_points(path)
+        (f'{head}\n1,2\n', 'not numbers'),
+        (f'{head}\n{",".join("a" * 12)}\n', 'not numbers'),
+    ):
+        path.write_text(text)
+        with pytest.raises(BagError, match=words):
+            read_points(path)
     with pytest.raises(BagError, match='cannot be read'):
         read_points(tmp_path / 'none.csv')
 
 
-@pytest.mark.parametrize('exact', [True, False])
-def test_places_of_a_table_are_the_exact_ones_where_it_has_them(tmp_path, exact):
-    names = [name for name in COLUMNS if exact or name not in PLACES]
-    row = dict.fromkeys(names, '1') | {'x': '500000.0', 'px': '500000.001'}
-    lines = [','.join(['stamp_ns', *names]), ','.join(['7', *(row[name] for name in names)])]
-    (tmp_path / 'soundings.csv').write_text('\n'.join(lines) + '\n')
-    read = read_points(tmp_path / 'soundings.csv')
-    assert read['x'].tolist() == [500000.001 if exact else 500000.0]
-    assert not set(PLACES) & set(read.columns)
+def test_places_of_a_table_are_the_exact_ones_where_it_has_them(tmp_path):
+    path = tmp_path / 'soundings.csv'
+    for exact, x in ((True, 500000.001), (False, 500000.0)):
+        names = [name for name in COLUMNS if exact or name not in PLACES]
+        row = dict.fromkeys(names, '1') | {'x': '500000.0', 'px': '500000.001'}
+        lines = [','.join(['stamp_ns', *names]), ','.join(['7', *(row[name] for name in names)])]
+        path.write_text('\n'.join(lines) + '\n')
+        read = read_points(path)
+        assert read['x'].tolist() == [x] and not set(PLACES) & set(read.columns)
 
 
 # -- soundings in coordinate systems and in the frame of other lines
@@ -254,45 +223,35 @@ def test_places_of_a_table_are_the_exact_ones_where_it_has_them(tmp_path, exact)
 NOWHERE = (0.0, 0.0, 0.0)
 
 
-def seen_from(origin, latitude, longitude):
-    x, y = origin.local(latitude, longitude)[:2]
-    return Points(np.arange(len(x)), {'x': x, 'y': y, 'z': -20.0 * np.ones(len(x))})
-
-
 def test_places_are_the_same_from_either_origin():
     rng = np.random.default_rng(1)
-    latitude, longitude = 54.3 + rng.uniform(-1, 1, 40) / 60, 10.1 + rng.uniform(-1, 1, 40) / 60
+    degrees = 54.3 + rng.uniform(-1, 1, 40) / 60, 10.1 + rng.uniform(-1, 1, 40) / 60
     here, there = Origin(54.3, 10.1), Origin(54.29, 10.12)
-    moved = seen_from(here, latitude, longitude).placed(here, None, NOWHERE, there)
-    wanted = seen_from(there, latitude, longitude)
-    for name in 'xy':
-        assert np.allclose(moved[name], wanted[name], atol=2e-3)
+    (x, y), wanted = here.local(*degrees)[:2], there.local(*degrees)[:2]
+    seen = Points(np.arange(40), {'x': x, 'y': y, 'z': np.full(40, -20.0)})
+    moved = seen.placed(here, None, NOWHERE, there)
+    assert np.allclose([moved['x'], moved['y']], wanted, atol=2e-3)
     assert (moved['z'] == -20.0).all()
-
-
-def test_the_central_meridian_of_utm_is_500_km_east_and_scaled():
-    pytest.importorskip('rasterio')
-    own = Origin(54.3, 9.0)
-    points = Points(np.arange(2), {name: np.array([0.0, 0.0]) for name in 'xz'})
-    points.columns['y'] = np.array([0.0, 1000.0])
-    there = points.placed(own, 25832, NOWHERE)
-    assert there['x'] == pytest.approx(500_000.0, abs=1e-3)
-    assert np.diff(there['y']) == pytest.approx(999.6, abs=0.01)
-
-
-def test_a_stated_place_of_the_origin_counts_before_its_latitude():
-    points = Points(np.arange(1), {name: np.array([1.0]) for name in 'xyz'})
-    moved = points.placed(Origin(54.3, 9.0), 25832, (500.0, 600.0, 7.0))
-    assert [moved[name][0] for name in 'xyz'] == [501.0, 601.0, 8.0]
-    assert points.placed(None, 25832, NOWHERE)['x'][0] == 1.0
-
-
-def test_an_origin_that_is_none_is_one_sentence():
+    # One that is none is one sentence.
     assert origin_of(None, 'a') is None and origin_of({}, 'a') is None
     assert origin_of({'origin': {'latitude': 1, 'longitude': '2'}}, 'a') == Origin(1.0, 2.0)
     for wrong in ([1, 2], {'latitude': 'x'}, 'x', {'up': 1}):
         with pytest.raises(BagError, match='cannot be understood'):
             origin_of({'origin': wrong}, 'a')
+
+
+def test_the_central_meridian_of_utm_is_500_km_east_and_scaled():
+    pytest.importorskip('rasterio')
+    ahead = {'x': np.zeros(2), 'y': np.array([0.0, 1000.0]), 'z': np.zeros(2)}
+    points = Points(np.arange(2), ahead)
+    there = points.placed(Origin(54.3, 9.0), 25832, NOWHERE)
+    assert there['x'] == pytest.approx(500_000.0, abs=1e-3)
+    assert np.diff(there['y']) == pytest.approx(999.6, abs=0.01)
+    # A stated place of the origin counts before its latitude.
+    points = Points(np.arange(1), {name: np.array([1.0]) for name in 'xyz'})
+    moved = points.placed(Origin(54.3, 9.0), 25832, (500.0, 600.0, 7.0))
+    assert [moved[name][0] for name in 'xyz'] == [501.0, 601.0, 8.0]
+    assert points.placed(None, 25832, NOWHERE)['x'][0] == 1.0
 
 
 # -- horizons: read back by other means than those that wrote them
@@ -322,24 +281,21 @@ def tracked(tmp_path_factory):
     folder = tmp_path_factory.mktemp('horizons')
     line = write_line(folder / 'line.seg')
     convert_segy(line, folder / 'bag', sample_spacing=SPACING, first_sample=FIRST, stack=STACK)
-    assert main(['track', str(folder / 'bag'), str(folder / 'run'), '--set', 'particles=500']) == 0
+    assert command('track', folder / 'bag', folder / 'run', '--set', 'particles=500') == 0
     return folder
 
 
 def export(folder, name, *options):
-    return main(['export', str(folder / 'run'), str(folder / name), *map(str, options)])
+    return command('export', folder / 'run', folder / name, *options)
 
 
 def picks(folder):
-    with (folder / 'run' / 'estimate.csv').open() as file:
-        return [row for row in csv.DictReader(file) if row['depth'] != 'nan']
+    return [row for row in rows_of(folder / 'run' / 'estimate.csv') if row['depth'] != 'nan']
 
 
 def test_the_table_has_every_pick_by_horizon(tracked):
-    assert export(tracked, 'h.csv') == 0
-    with (tracked / 'h.csv').open() as file:
-        rows = list(csv.DictReader(file))
-    known = picks(tracked)
+    assert export(tracked, 'h.csv') == export(tracked, 'h.geojson') == 0
+    rows, known = rows_of(tracked / 'h.csv'), picks(tracked)
     assert len(rows) == len(known) >= 2 * T // STACK
     order = [(int(row['horizon']), int(row['trace'])) for row in rows]
     assert order == sorted(order) and {row['line'] for row in rows} == {'line.seg'}
@@ -355,24 +311,30 @@ def test_the_table_has_every_pick_by_horizon(tracked):
         way = step * min(int(row['trace']) - 1, T // STACK - 1.75)
         assert float(row['distance_m']) == pytest.approx(way, abs=0.02)
     assert rows[0]['time_utc'].startswith('2018-03-13T00:00:00.')
+    # The same as points along the track.
+    content = json.loads((tracked / 'h.geojson').read_text())
+    assert content['type'] == 'FeatureCollection' and len(content['features']) == len(known)
+    for item in content['features']:
+        east, north, up = item['geometry']['coordinates']
+        assert item['geometry']['type'] == 'Point' and -91.65 < east < -91.63
+        assert up == -item['properties']['depth_m'] and north == pytest.approx(17.13, abs=1e-5)
 
 
-@pytest.mark.parametrize('speed', [True, '1500', None, 0.0, 1e5])
-def test_a_speed_of_a_run_that_is_none_is_said(tracked, tmp_path, capsys, speed):
+def test_a_speed_of_a_run_that_is_none_is_said(tracked, tmp_path, capsys):
     shutil.copytree(tracked / 'run', tmp_path / 'run')
-    run = json.loads((tmp_path / 'run' / 'run.json').read_text())
-    run['parameters']['sound_speed'] = speed
-    (tmp_path / 'run' / 'run.json').write_text(json.dumps(run))
-    assert export(tmp_path, 'h.csv') == 2
+    record = json.loads((tmp_path / 'run' / 'run.json').read_text())
     said = f'the sound_speed in the run.json of {tmp_path / "run"} is no speed'
-    assert said in capsys.readouterr().err
+    for speed in (True, '1500', None, 0.0, 1e5):
+        record['parameters']['sound_speed'] = speed
+        (tmp_path / 'run' / 'run.json').write_text(json.dumps(record))
+        assert export(tmp_path, 'h.csv') == 2
+        assert said in capsys.readouterr().err
 
 
 def test_map_coordinates(tracked):
     pytest.importorskip('rasterio')
     assert export(tracked, 'm.csv', '--epsg', 32615) == 0
-    with (tracked / 'm.csv').open() as file:
-        row = next(csv.DictReader(file))
+    row = rows_of(tracked / 'm.csv')[0]
     # Zone 15 by the series for the transverse Mercator projection, worked out by hand.
     a, e2, k0 = 6_378_137.0, 0.00669437999014, 0.9996
     lat, dlon = np.radians(17.13), np.radians(float(row['longitude']) + 93.0)
@@ -380,17 +342,6 @@ def test_map_coordinates(tracked):
     A = dlon * np.cos(lat)
     east = 500_000.0 + k0 * n * (A + (1.0 - np.tan(lat) ** 2) * A**3 / 6.0)
     assert float(row['x']) == pytest.approx(east, abs=0.5)
-
-
-def test_points_along_the_track(tracked):
-    assert export(tracked, 'h.geojson') == 0
-    content = json.loads((tracked / 'h.geojson').read_text())
-    assert content['type'] == 'FeatureCollection'
-    assert len(content['features']) == len(picks(tracked))
-    for item in content['features']:
-        east, north, up = item['geometry']['coordinates']
-        assert item['geometry']['type'] == 'Point' and -91.65 < east < -91.63
-        assert up == -item['properties']['depth_m'] and north == pytest.approx(17.13, abs=1e-5)
 
 
 def test_segy_read_by_segyio_and_by_hand(tracked):
@@ -423,36 +374,30 @@ def test_segy_read_by_segyio_and_by_hand(tracked):
     assert convert_segy(original, tracked / 'again', sample_spacing=SPACING).rows == T
 
 
-@pytest.mark.parametrize(
-    'name, options, words',
-    [
-        ('tracks.gpx', [], 'is for tracks'),
+def test_what_cannot_be_exported_is_one_sentence(tracked, capsys):
+    other, segyio = tracked / 'other.seg', pytest.importorskip('segyio')
+    write_line(other)
+    with segyio.open(str(other), 'r+', ignore_geometry=True) as file:
+        for k in range(T):
+            file.header[k].update({segyio.TraceField.HourOfDay: 5})
+    for name, options, words in (
+        ('tracks.gpx', (), 'is for tracks'),
         ('x.sgy', (), 'needs --segy'),
         ('x.txt', (), 'ends in none of'),
-        ('line.seg', ('--segy', 'line.seg', '--overwrite'), 'stays as it is'),
-        ('x.sgy', ('--segy', 'other.seg'), 'its times are others'),
+        ('line.seg', ('--segy', tracked / 'line.seg', '--overwrite'), 'stays as it is'),
+        ('x.sgy', ('--segy', other), 'its times are others'),
         ('x.xyz', (), 'no soundings'),
-    ],
-)
-def test_what_cannot_be_exported_is_one_sentence(tracked, capsys, name, options, words):
-    other, segyio = tracked / 'other.seg', pytest.importorskip('segyio')
-    if not other.exists():
-        write_line(other)
-        with segyio.open(str(other), 'r+', ignore_geometry=True) as file:
-            for k in range(T):
-                file.header[k].update({segyio.TraceField.HourOfDay: 5})
-    options = [tracked / option if str(option).endswith('.seg') else option for option in options]
-    assert export(tracked, name, *options) == 2
-    error = capsys.readouterr().err
-    assert words in error and 'Traceback' not in error
-    assert not (tracked / 'x.sgy').exists()
+    ):
+        assert export(tracked, name, *options) == 2
+        error = capsys.readouterr().err
+        assert words in error and 'Traceback' not in error
+        assert not (tracked / 'x.sgy').exists()
 
 
 def test_without_places_there_is_a_table_but_no_map(tracked, tmp_path, capsys):
-    scene = ('simulate', 'fathometer', str(tmp_path / 'bag'), '--scenario', 'diffuse')
-    assert main([*scene, '--set', 'records=4']) == 0
-    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run')]) == 0
-    assert export(tmp_path, 'h.csv') == 0
+    scene = ('simulate', 'fathometer', tmp_path / 'bag', '--scenario', 'diffuse')
+    assert command(*scene, '--set', 'records=4') == 0
+    assert command('track', tmp_path / 'bag', tmp_path / 'run') == export(tmp_path, 'h.csv') == 0
     for name, options, words in (
         ('h.geojson', (), 'no positions'),
         ('m.csv', ('--epsg', 32615), 'no positions'),
@@ -469,22 +414,16 @@ def test_places_by_navigation(tracked, tmp_path, capsys):
         places = read_positions(bag)
         for item in bag.messages(['/trace']):
             out.write('/trace', item.message, item.log_ns)
-        east, north = transform(
-            'EPSG:4326', 'EPSG:32615', places.longitude.tolist(), places.latitude.tolist()
-        )
-        for k, stamp in enumerate(places.stamp_ns.tolist()):
-            here = Navigation(
-                stamp_ns=stamp,
-                frame_id='map',
-                child_frame_id='boat',
-                position=np.array([east[k] - 850_000.0, north[k] - 1_890_000.0, 0.0]),
-                orientation=np.array([0.0, 0.0, 0.0, 1.0]),
-            )
+        degrees = places.longitude.tolist(), places.latitude.tolist()
+        east, north = map(np.array, transform('EPSG:4326', 'EPSG:32615', *degrees))
+        ways = np.column_stack([east - 850_000.0, north - 1_890_000.0, 0.0 * east])
+        facts = {'frame_id': 'map', 'child_frame_id': 'boat', 'orientation': (0.0, 0.0, 0.0, 1.0)}
+        for stamp, position in zip(places.stamp_ns.tolist(), ways):
+            here = Navigation(stamp_ns=stamp, position=position, **facts)
             out.write('/nav', write_navigation(here, ros_message), stamp)
-    text = (tracked / 'bag' / 'parameters.yaml').read_text()
-    (tmp_path / 'bag' / 'parameters.yaml').write_text(text)
+    shutil.copy(tracked / 'bag' / 'parameters.yaml', tmp_path / 'bag')
     run = 'track', tmp_path / 'bag', tmp_path / 'run', '--system', 'fathometer'
-    assert main([*map(str, run), '--set', 'particles=500']) == 0
+    assert command(*run, '--set', 'particles=500') == 0
     capsys.readouterr()
     assert export(tmp_path, 'n.geojson') == 2
     assert '--origin' in capsys.readouterr().err

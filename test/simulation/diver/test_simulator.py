@@ -17,18 +17,25 @@ from sonar_imm.measurements import Fix
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.georeferencing import Georeferencer
+from sonar_imm_tools.simulation.diver import simulator
 from sonar_imm_tools.simulation.diver.fixes import CLOSEST, crossing_paths, ORIGIN
-from sonar_imm_tools.simulation.diver.simulator import (
-    draw_errors,
-    RECEIVERS,
-    scenario,
-    simulate,
-    TRANSMITTER,
-)
+from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate
+
+
+def run(name, seed=1, **overrides):
+    return simulate(scenario(name, overrides), seed)
+
+
+def errors_of(scene):
+    """Errors (n, 3) of fixes of the first diver, one for each place."""
+    return [
+        item.measurement.position - place
+        for item, place in zip(scene.measurements, scene.truth[0].position)
+    ]
 
 
 def test_table_1_starts_where_the_paper_says_at_its_speed():
-    scene = simulate(scenario('table1'), 1)
+    scene = run('table1')
     track = scene.truth[0]
     np.testing.assert_array_equal(track.position[0], [-40.0, 40.0, 0.0])
     np.testing.assert_allclose(np.hypot(*track.velocity.T), 1.0)
@@ -36,60 +43,49 @@ def test_table_1_starts_where_the_paper_says_at_its_speed():
     steps = np.diff(track.position[:, :2], axis=0)
     np.testing.assert_allclose(steps, track.velocity[1:], atol=1e-9)
     assert np.abs(np.arctan2(*track.velocity.T[::-1])).max() <= np.pi / 2 + 1e-9
+    # A turned scene keeps its distances.
+    plain, turned = (
+        run('table1', 9, random_rotation=rotation).truth[0].position[0]
+        for rotation in (False, True)
+    )
+    assert np.hypot(*plain[:2]) == pytest.approx(np.hypot(*turned[:2]))
+    assert not np.allclose(plain, turned)
 
 
 def test_fixes_are_as_accurate_as_they_say():
     squared = []
     for seed in range(20):
-        scene = simulate(scenario('table1'), seed)
-        for item, place in zip(scene.measurements, scene.truth[0].position):
-            error = item.measurement.position[:2] - place[:2]
-            squared.append(error @ np.linalg.solve(item.measurement.covariance[:2, :2], error))
+        scene = run('table1', seed)
+        for item, error in zip(scene.measurements, errors_of(scene)):
+            R = item.measurement.covariance[:2, :2]
+            squared.append(error[:2] @ np.linalg.solve(R, error[:2]))
     assert np.mean(squared) == pytest.approx(2.0, abs=0.15)
-    plain = simulate(scenario('table1', {'sensor': 'positions', 'duration': 999.0}), 1)
-    pairs = zip(plain.measurements, plain.truth[0].position)
-    errors = [item.measurement.position[:2] - place[:2] for item, place in pairs]
-    assert np.std(errors) == pytest.approx(1.0, rel=0.07)  # metres, unless it is told otherwise
+    plain = np.array(errors_of(run('table1', sensor='positions', duration=999.0)))
+    assert np.std(plain[:, :2]) == pytest.approx(1.0, rel=0.07)  # metres, unless told otherwise
 
 
 @pytest.mark.statistics
 def test_misses_clutter_and_outliers_come_as_often_as_asked():
-    missed = simulate(scenario('table1', {'detection_probability': 0.7, 'duration': 2000.0}), 5)
+    missed = run('table1', 5, detection_probability=0.7, duration=2000.0)
     assert len(missed.measurements) == pytest.approx(0.7 * 2001, abs=80)
-    cluttered = simulate(scenario('table1', {'clutter': 3.0, 'duration': 400.0}), 6)
+    cluttered = run('table1', 6, clutter=3.0, duration=400.0)
     assert len(cluttered.measurements) == pytest.approx(4.0 * 401, abs=150)
-    scene = simulate(scenario('table1', {'outlier_probability': 0.1, 'duration': 2000.0}), 7)
-    error = [
-        np.hypot(*(item.measurement.position - place)[:2])
-        for item, place in zip(scene.measurements, scene.truth[0].position)
-    ]
+    scene = run('table1', 7, outlier_probability=0.1, duration=2000.0)
+    error = np.linalg.norm(np.array(errors_of(scene))[:, :2], axis=1)
     # A bearing error of 2 degrees is never 8 times its size; most outliers are far off.
     far = np.linalg.norm(scene.truth[0].position[:, :2], axis=1) * np.deg2rad(16.0)
-    assert np.mean(np.array(error) > far) == pytest.approx(0.1, abs=0.03)
+    assert np.mean(error > far) == pytest.approx(0.1, abs=0.03)
 
 
-def test_late_scans_are_received_late_and_out_of_order():
-    scene = simulate(scenario('irregular'), 8)
-    received = [item.received_ns for item in scene.measurements]
-    delay = np.array([item.received_ns - item.measurement.stamp_ns for item in scene.measurements])
-    assert received == sorted(received)
+def test_late_scans_are_received_late_and_several_divers_are_several():
+    scene = run('irregular', 8)
+    received = np.array([item.received_ns for item in scene.measurements])
+    stamps = np.array([item.measurement.stamp_ns for item in scene.measurements])
+    delay = received - stamps
+    assert (np.diff(received) >= 0).all() and (np.diff(stamps) < 0).any()
     assert (delay >= 0).all() and delay.max() <= 3e9
     assert np.mean(delay > 0) == pytest.approx(0.25, abs=0.12)
-    assert (np.diff([item.measurement.stamp_ns for item in scene.measurements]) < 0).any()
-
-
-def test_a_turned_scene_keeps_its_distances():
-    plain, turned = (
-        simulate(scenario('table1', {'random_rotation': rotation}), 9)
-        for rotation in (False, True)
-    )
-    start, other = plain.truth[0].position[0], turned.truth[0].position[0]
-    assert np.hypot(*start[:2]) == pytest.approx(np.hypot(*other[:2]))
-    assert not np.allclose(start, other)
-
-
-def test_several_divers_are_several():
-    scene = simulate(scenario('several'), 10)
+    scene = run('several', 10)
     assert [track.track_id for track in scene.truth] == [1, 2, 3, 4]
     starts = np.array([track.position[0, :2] for track in scene.truth])
     gaps = np.linalg.norm(starts[:, None] - starts, axis=-1) + 1e9 * np.eye(4)
@@ -97,21 +93,18 @@ def test_several_divers_are_several():
     assert all(isinstance(item.measurement, Fix) for item in scene.measurements)
 
 
-@pytest.mark.parametrize(
-    ('values', 'says'),
-    [
+def test_mistakes_get_a_sentence():
+    for values, says in (
         ({'leg_min': 20.0}, 'leg_min cannot exceed'),
         ({'start': (1.0,)}, 'two values'),
         ({'motion': 'swim'}, 'one of'),
-    ],
-)
-def test_mistakes_get_a_sentence(values, says):
-    with pytest.raises(ConfigError, match=says):
-        scenario('table1', values)
+    ):
+        with pytest.raises(ConfigError, match=says):
+            scenario('table1', values)
 
 
 def test_positions_on_earth_lie_where_the_truth_does():
-    scene = simulate(scenario('geodetic', {'fix_std': 0.5}), 2)
+    scene = run('geodetic', 2, fix_std=0.5)
     truth = dict(zip(scene.truth[0].stamp_ns.tolist(), scene.truth[0].position))
     entries = [item.measurement for item in scene.measurements]
     places = [ORIGIN.local(each.latitude, each.longitude, each.height)[:2] for each in entries]
@@ -120,8 +113,7 @@ def test_positions_on_earth_lie_where_the_truth_does():
 
 
 def test_what_a_vessel_sees_is_consistent_where_it_is_placed():
-    config = scenario('usbl')
-    nees = []
+    config, nees = scenario('usbl'), []
     for seed in range(4):
         scene = simulate(config, seed)
         truth = {each.track_id: dict(zip(each.stamp_ns, each.position)) for each in scene.truth}
@@ -135,10 +127,6 @@ def test_what_a_vessel_sees_is_consistent_where_it_is_placed():
 
 
 # -- what the sensors say of divers, by geometry and statistics of its own ------------------------
-
-
-def run(name, seed=1, **overrides):
-    return simulate(scenario(name, overrides), seed)
 
 
 def arrivals(scene):
@@ -155,27 +143,25 @@ def test_errors_of_arrival_times_are_independent_and_as_large_as_told():
     scene = run('multistatic', sound_speed=1480.0, toa_std=3e-4, duration=600.0, **CLEAN)
     errors = []
     for ping, (place,) in arrivals(scene):
-        path = np.linalg.norm(place - TRANSMITTER) + np.linalg.norm(place - RECEIVERS, axis=1)
+        path = np.linalg.norm(place - simulator.TRANSMITTER) + np.linalg.norm(
+            place - RECEIVERS, axis=1
+        )
         assert ping.rx_id.tolist() == [0, 1, 2, 3] and (ping.var_toa == 3e-4**2).all()
         errors.append((ping.toa - path / 1480.0) / 3e-4)
     errors = np.array(errors)
-    assert errors.shape == (601, 4)
-    assert np.abs(errors.mean(axis=0)).max() < 4.0 / np.sqrt(601)
+    assert errors.shape == (601, 4) and np.abs(errors.mean(axis=0)).max() < 4.0 / np.sqrt(601)
     assert np.std(errors) == pytest.approx(1.0, abs=0.06)
     assert np.abs(np.corrcoef(errors.T) - np.eye(4)).max() < 0.17
 
 
 def test_receivers_miss_and_hear_reflections_each_for_itself():
-    scene = run(
-        'multistatic', detection_probability=0.6, outlier_probability=0.2, toa_std=1e-7,
-        duration=1500.0, sound_speed=1480.0,
-    )  # fmt: skip
+    told = {'detection_probability': 0.6, 'outlier_probability': 0.2, 'toa_std': 1e-7}
+    scene = run('multistatic', **told, duration=1500.0, sound_speed=1480.0)
     received, late = np.zeros(4), []
     for ping, (place,) in arrivals(scene):
-        for receiver, toa in zip(ping.rx_id, ping.toa):
-            received[receiver] += 1
-            direct = np.linalg.norm(place) + np.linalg.norm(place - RECEIVERS[receiver])
-            late.append(toa * 1480.0 - direct)
+        received[ping.rx_id] += 1
+        direct = np.linalg.norm(place) + np.linalg.norm(place - RECEIVERS[ping.rx_id], axis=1)
+        late += (ping.toa * 1480.0 - direct).tolist()
     assert received / 1501 == pytest.approx([0.6] * 4, abs=0.05)
     late = np.array(late)
     reflected = late > 1.0
@@ -188,28 +174,22 @@ def test_receivers_miss_and_hear_reflections_each_for_itself():
 def test_false_arrivals_come_after_the_direct_sound():
     clutter = {'clutter': 2.0, 'clutter_range': 30.0, 'detection_probability': 0.0}
     scene = run('multistatic', **clutter, duration=500.0, sound_speed=1480.0)
-    count, late = np.zeros(4), []
-    for ping, _ in arrivals(scene):
-        late.append(
-            ping.toa * 1480.0 - np.linalg.norm(RECEIVERS[ping.rx_id] - TRANSMITTER, axis=1)
-        )
-        count += np.bincount(ping.rx_id.astype(int), minlength=4)
-    late = np.concatenate(late)
+    pings = [ping for ping, _ in arrivals(scene)]
+    heard = np.concatenate([ping.rx_id for ping in pings]).astype(int)
+    toa = np.concatenate([ping.toa for ping in pings])
+    direct = np.linalg.norm(RECEIVERS - simulator.TRANSMITTER, axis=1)
+    late = toa * 1480.0 - direct[heard]
     assert 0.0 <= late.min() < 1.0 and 59.0 < late.max() <= 60.0  # twice the range
-    assert count / 501 == pytest.approx([2.0] * 4, abs=0.26)
+    assert np.bincount(heard, minlength=4) / 501 == pytest.approx([2.0] * 4, abs=0.26)
 
 
 def test_polar_fixes_have_the_errors_of_a_polar_sonar():
     """Along the line of sight the error of the range, across it that of the bearing."""
-    along, across = [], []
+    error, place = [], np.array([-60.0, 25.0])
     for seed in range(8):
-        scene = run('still', seed, range_std=0.3, bearing_std_deg=1.5, start=(-60.0, 25.0))
-        place = scene.truth[0].position[0, :2]
-        for item in scene.measurements:
-            error = item.measurement.position[:2] - place
-            along.append(error @ place / 65.0)
-            across.append((error[1] * place[0] - error[0] * place[1]) / 65.0**2)
-    n = len(along)
+        error += errors_of(run('still', seed, range_std=0.3, bearing_std_deg=1.5, start=(-60, 25)))
+    error, n = np.array(error)[:, :2], len(error)
+    along, across = error @ place / 65.0, error @ [-place[1], place[0]] / 65.0**2
     # The converted fix is shrunk by exp(-s^2 / 2) of its range, 22 mm here.
     assert np.mean(along) == pytest.approx(-65.0 * np.radians(1.5) ** 2, abs=4 * 0.3 / np.sqrt(n))
     assert np.std(along) == pytest.approx(0.3, rel=0.1)
@@ -244,7 +224,7 @@ def test_clutter_fills_the_square_evenly():
 # -- motions --------------------------------------------------------------------------------------
 
 
-def test_a_circle_closes_after_eighty_seconds():
+def test_a_circle_closes_and_positions_are_the_sum_of_the_velocities_at_any_step():
     track = run('circle', duration=160.0, step=0.1).truth[0]
     place = track.position[:, :2]
     np.testing.assert_allclose(place[800], place[0], atol=1e-6)
@@ -252,23 +232,21 @@ def test_a_circle_closes_after_eighty_seconds():
     assert np.linalg.norm(place[400] - place[0]) == pytest.approx(2.0 * radius, rel=1e-3)
     heading = np.unwrap(np.arctan2(*track.velocity.T[::-1]))
     np.testing.assert_allclose(np.diff(heading), 2.0 * np.pi / 800.0, rtol=1e-6)
+    track = run('table1', step_jitter=0.8, duration=50.0).truth[0]
+    dt = np.diff(track.stamp_ns) * 1e-9
+    assert dt.std() > 0.2 and dt.min() > 0.0
+    moved = np.diff(track.position[:, :2], axis=0)
+    np.testing.assert_allclose(moved, track.velocity[1:] * dt[:, None], atol=1e-8)
 
 
-def test_a_zigzag_turns_every_ten_seconds():
+def test_a_zigzag_turns_every_ten_seconds_one_leg_of_three_is_a_rest_and_legs_last_as_told():
     scene = run('zigzag', random_rotation=False, heading_deg=20.0)
     degrees = np.degrees(np.arctan2(*scene.truth[0].velocity.T[::-1]))
     assert sorted(set(np.round(degrees, 6))) == [-40.0, 80.0]
-    turns = np.flatnonzero(np.diff(degrees))
-    np.testing.assert_array_equal(np.diff(turns), 10)
-
-
-def test_one_leg_of_three_is_a_rest():
+    np.testing.assert_array_equal(np.diff(np.flatnonzero(np.diff(degrees))), 10)
     speeds = np.hypot(*run('stop_and_go', duration=5000.0).truth[0].velocity.T)
     assert set(np.round(speeds, 9)) == {0.0, 0.75}
     assert np.mean(speeds == 0.0) == pytest.approx(1.0 / 3.0, abs=0.03)
-
-
-def test_legs_last_as_long_as_told():
     track = run('table1', duration=3000.0, step=0.5, leg_min=4.0, leg_max=6.0).truth[0]
     turned = np.flatnonzero(np.abs(np.diff(track.velocity[:, 0])) > 1e-9)
     seconds = np.diff(turned) * 0.5
@@ -276,19 +254,10 @@ def test_legs_last_as_long_as_told():
     assert seconds.mean() == pytest.approx(5.0, abs=0.15)
 
 
-def test_positions_are_the_sum_of_the_velocities_at_any_step():
-    scene = run('table1', step_jitter=0.8, duration=50.0)
-    track = scene.truth[0]
-    dt = np.diff(track.stamp_ns) * 1e-9
-    assert dt.std() > 0.2 and dt.min() > 0.0
-    moved = np.diff(track.position[:, :2], axis=0)
-    np.testing.assert_allclose(moved, track.velocity[1:] * dt[:, None], atol=1e-8)
-
-
 def test_divers_rise_and_sink_with_the_swell_by_its_height_and_period():
     config = scenario('table1', {'depth': [4.0, 4.0], 'swell_height': 0.5, 'swell_period': 8.0})
     times = 0.5 * np.arange(160)
-    (height,) = draw_errors(config, times, np.random.default_rng(3)).height.T
+    (height,) = simulator.draw_errors(config, times, np.random.default_rng(3)).height.T
     assert np.ptp(height) == pytest.approx(1.0, abs=0.05)
     assert height.mean() == pytest.approx(-4.0, abs=1e-9)
     np.testing.assert_allclose(height[16:], height[:-16], atol=1e-9)
@@ -297,23 +266,22 @@ def test_divers_rise_and_sink_with_the_swell_by_its_height_and_period():
 def test_positions_have_the_errors_they_state_and_a_height_where_it_is_measured():
     """White errors of half a metre, and nothing else, in 500 fixes."""
     scene = {'sensor': 'positions', 'fix_std': 0.5, 'duration': 499.0, 'depth': (-8.0, -8.0)}
-    for height_std in (0.0, 0.2):
-        simulated = simulate(scenario('table1', {**scene, 'fix_height_std': height_std}), 3)
-        fixes = [each.measurement for each in simulated.measurements]
-        stated = [0.25, 0.25, 0.04][: 3 if height_std else 2]
-        for fix in fixes:
-            known = np.isfinite(np.diag(fix.covariance))  # NaN: not measured
-            np.testing.assert_allclose(np.diag(fix.covariance)[known], stated)
-        error = [fix.position for fix in fixes] - simulated.truth[0].position
-        measured = error[:, : len(stated)]
+    for height_std, stated in ((0.0, [0.25, 0.25]), (0.2, [0.25, 0.25, 0.04])):
+        simulated = run('table1', 3, **scene, fix_height_std=height_std)
+        for item in simulated.measurements:
+            variances = np.diag(item.measurement.covariance)
+            np.testing.assert_allclose(variances[np.isfinite(variances)], stated)
+        measured = np.array(errors_of(simulated))[:, : len(stated)]  # NaN: not measured
         np.testing.assert_allclose(np.cov(measured.T), np.diag(stated), atol=0.05)
 
 
 def test_a_scan_holds_the_divers_that_are_seen_and_clutter_in_no_order():
     """Nearly exact fixes of a crossing: those at a diver are of divers, the others fill a square
     of 160 m."""
-    config = scenario('crossing', {'fix_std': 1e-3, 'clutter': 6.0})
-    simulated = simulate(config, 4)
+    told = scenario('crossing').instruments()
+    assert told == {'clutter_density': 10.0 / 160.0**2, 'detection_probability': 0.9}
+    assert 'clutter_density' not in scenario('table1').instruments()
+    simulated = run('crossing', 4, fix_std=1e-3, clutter=6.0)
     truth = np.array([track.position for track in simulated.truth])
     seen, first, false = 0, 0, []
     for each, places in zip(simulated.measurements, truth.swapaxes(0, 1)):
@@ -322,19 +290,11 @@ def test_a_scan_holds_the_divers_that_are_seen_and_clutter_in_no_order():
         off = np.linalg.norm(fixes[:, None, :2] - places[None, :, :2], axis=2).min(axis=1)
         seen, first = seen + (off < 0.01).sum(), first + (off[0] < 0.01)
         false.append(fixes[off >= 0.01, :2])
-    scans = len(simulated.measurements)
+    scans, false = len(simulated.measurements), np.concatenate(false)
     assert seen / scans == pytest.approx(4 * 0.9, abs=0.2)
-    assert len(np.concatenate(false)) / scans == pytest.approx(6.0, abs=0.6)
-    assert np.abs(np.concatenate(false)).max() == pytest.approx(80.0, abs=1.0)
+    assert len(false) / scans == pytest.approx(6.0, abs=0.6)
+    assert np.abs(false).max() == pytest.approx(80.0, abs=1.0)
     assert 0.2 < first / scans < 0.6  # a diver is not always the first
-
-
-def test_of_scans_is_known_how_often_divers_are_seen_and_how_dense_the_clutter_is():
-    assert scenario('crossing').instruments() == {
-        'clutter_density': 10.0 / 160.0**2,
-        'detection_probability': 0.9,
-    }
-    assert 'clutter_density' not in scenario('table1').instruments()
 
 
 @pytest.mark.parametrize('divers, std, stated', [(1, 0.2, True), (1, 0.0, False), (2, 0.2, False)])
@@ -348,8 +308,8 @@ def test_a_depth_is_stated_where_it_is_measured_and_there_is_one_it_can_be_of(di
             assert each.measurement.depth == pytest.approx(true, abs=0.8)
 
 
-@pytest.mark.parametrize('seed', range(8))
-def test_divers_who_cross_come_as_near_as_they_are_said_to(seed):
-    paths = crossing_paths(6, np.linspace(0.0, 100.0, 2001), np.random.default_rng(seed))
-    for first, other in zip(paths[::2], paths[1::2]):
-        assert np.linalg.norm(first[:, :2] - other[:, :2], axis=1).min() < CLOSEST + 0.05
+def test_divers_who_cross_come_as_near_as_they_are_said_to():
+    for seed in range(8):
+        paths = crossing_paths(6, np.linspace(0.0, 100.0, 2001), np.random.default_rng(seed))
+        for first, other in zip(paths[::2], paths[1::2]):
+            assert np.linalg.norm(first[:, :2] - other[:, :2], axis=1).min() < CLOSEST + 0.05

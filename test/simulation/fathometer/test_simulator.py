@@ -18,14 +18,9 @@ from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.simulation.fathometer import simulator
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of
-from sonar_imm_tools.simulation.fathometer.simulator import (
-    _envelope,
-    cross_spectra,
-    scenario,
-    SCENARIOS,
-    simulate,
-)
+from sonar_imm_tools.simulation.fathometer.simulator import scenario, SCENARIOS, simulate
 
 
 @pytest.mark.parametrize('name', SCENARIOS)
@@ -37,27 +32,29 @@ def test_every_scenario_can_be_made_small(name):
     assert kinds <= {CrossSpectra, Trace, Pressure, ArrayDepth}
 
 
+def made(name='drift', seed=0, **changes):
+    return simulate(scenario(name, changes), seed)
+
+
+def drifted(seed, name='drift', **changes):
+    return drift_of(scenario(name, changes), np.random.default_rng(seed))
+
+
 def test_layers_fade_and_appear_as_told():
-    config = scenario('drift', {'appearing': (10, 50), 'fading': (30,), 'records': 100})
-    drift = drift_of(config, np.random.default_rng(0))
+    drift = drifted(0, appearing=(10, 50), fading=(30,), records=100)
     assert drift.present.sum(axis=1)[[0, 20, 45, 99]].tolist() == [8, 9, 8, 9]
-    assert drift.present[:, 0].all()
-    assert (drift.amplitude[:, 0] > 0.2).all()
-    config = scenario('drift', {'appearing': (), 'fading': (30, 40, 50), 'records': 100})
-    left = drift_of(config, np.random.default_rng(0)).present[99]
+    assert drift.present[:, 0].all() and (drift.amplitude[:, 0] > 0.2).all()
+    left = drifted(0, appearing=(), fading=(30, 40, 50), records=100).present[99]
     assert np.flatnonzero(~left).tolist() == [3, 5, 7]  # no neighbours
 
 
 def test_traces_hold_the_pulse_of_each_layer_and_noise_as_stated():
-    config = scenario(
-        'drift_traces', {'records': 50, 'layers': 1, 'appearing': (), 'fading': (),
-                         'array_depth_std': 0.0},
-    )  # fmt: skip
-    scene = simulate(config, 0)
-    noise = []
+    still = {'layers': 1, 'appearing': (), 'fading': (), 'array_depth_std': 0.0}
+    scene, noise = made('drift_traces', records=50, **still), []
+    wave = band_pulse(50.0, 4000.0, 1500.0)
     for received, truth in zip(scene.measurements, scene.truth):
         trace = received.measurement
-        pulse = band_pulse(50.0, 4000.0, 1500.0)(trace.depth - truth.depth[0])
+        pulse = wave(trace.depth - truth.depth[0])
         amplitude = trace.amplitude @ pulse / (pulse @ pulse)
         noise.append(trace.amplitude - amplitude * pulse)
         assert amplitude > 0.01
@@ -65,12 +62,11 @@ def test_traces_hold_the_pulse_of_each_layer_and_noise_as_stated():
     # The noise is as correlated as the pulse.
     noise = np.array(noise)
     seen = np.mean(noise[:, 3:] * noise[:, :-3]) / np.var(noise)
-    assert seen == pytest.approx(band_pulse(50.0, 4000.0, 1500.0)(3.0 / 32.0), abs=0.05)
+    assert seen == pytest.approx(wave(3.0 / 32.0), abs=0.05)
 
 
-@pytest.mark.parametrize(
-    'overrides, word',
-    [
+def test_scenes_that_cannot_be():
+    for overrides, word in (
         ({'frequency_min': 5000.0}, 'frequency_max'),
         ({'ship_pass': (3,)}, 'ship_pass'),
         ({'level': 'pressure'}, '600 s'),
@@ -78,28 +74,25 @@ def test_traces_hold_the_pulse_of_each_layer_and_noise_as_stated():
         ({'layers': 1}, 'no layer'),
         ({'level': 'csdm'}, '13.6 GB'),
         ({'records': 0}, 'records'),
-    ],
-)
-def test_scenes_that_cannot_be(overrides, word):
-    with pytest.raises(ConfigError, match=word):
-        scenario('drift', overrides)
+    ):
+        with pytest.raises(ConfigError, match=word):
+            scenario('drift', overrides)
 
 
 def test_pressure_in_whole_numbers_has_the_steps_it_was_told():
-    changes = {'records': 1, 'record_seconds': 1.0, 'block_seconds': 0.3}
-    coarse = simulate(scenario('pressure', {**changes, 'steps_per_sigma': 2.5}), 1)
-    fine = simulate(scenario('pressure', {**changes, 'steps_per_sigma': 0.0}), 1)
-    a = np.concatenate([item.measurement.pressure for item in coarse.measurements])
-    b = np.concatenate([item.measurement.pressure for item in fine.measurements])
-    (scale,) = {item.measurement.scale for item in coarse.measurements}
-    assert [len(item.measurement) for item in coarse.measurements] == [1800, 1800, 1800, 600]
+    short = {'records': 1, 'record_seconds': 1.0, 'block_seconds': 0.3}
+    coarse, fine = (
+        [item.measurement for item in made('pressure', 1, **short, steps_per_sigma=n).measurements]
+        for n in (2.5, 0.0)
+    )
+    a, b = (np.concatenate([item.pressure for item in each]) for each in (coarse, fine))
+    (scale,) = {item.scale for item in coarse}
+    assert [len(item) for item in coarse] == [1800, 1800, 1800, 600]
     assert scale == pytest.approx(b.std() / 2.5, rel=1e-3)
     assert np.abs(a - b).max() <= 0.5001 * scale
     assert np.abs(a / scale - np.round(a / scale)).max() < 1e-4
-    assert {item.measurement.scale for item in fine.measurements} == {0.0}
-
-
-def test_what_a_tracker_is_told_of_pressure_leaves_its_snapshots_to_it():
+    assert {item.scale for item in fine} == {0.0}
+    # The tracker is left to choose its snapshots.
     given = scenario('pressure').instruments()
     assert 'snapshot_seconds' not in given
     assert (given['depth_min'], given['depth_max']) == (42.0, 74.0)
@@ -107,13 +100,11 @@ def test_what_a_tracker_is_told_of_pressure_leaves_its_snapshots_to_it():
 
 
 def test_whitened_spectra_are_even():
-    changes = {'records': 1, 'snapshots': 400, 'ship_noise': 0.0}
-    red, even = (
-        simulate(scenario('small', {**changes, 'whitened': white}), 1).measurements[-1].measurement
-        for white in (False, True)
-    )
-    power = [np.einsum('fmm->f', item.csdm).real for item in (red, even)]
-    ratio = [each[10] / each[-10] for each in power]
+    changes, ratio = {'records': 1, 'snapshots': 400, 'ship_noise': 0.0}, []
+    for white in (False, True):
+        spectra = made('small', 1, **changes, whitened=white).measurements[-1].measurement
+        power = np.einsum('fmm->f', spectra.csdm).real
+        ratio.append(power[10] / power[-10])
     assert ratio[0] > 20.0 and 0.5 < ratio[1] < 2.0
 
 
@@ -161,7 +152,7 @@ def expected(frequency, config, heights, amplitudes, ships=True):
 
 def drawn(snapshots, seed=1, **overrides):
     config = scenario('drift', {**ODD, 'snapshots': snapshots, **overrides})
-    spectra = cross_spectra(config, floor(*LAYERS), 0, None, np.random.default_rng(seed))
+    spectra = simulator.cross_spectra(config, floor(*LAYERS), 0, None, np.random.default_rng(seed))
     return config, spectra
 
 
@@ -171,15 +162,18 @@ def relative(csdm, R):
     return (csdm - R) / power[:, :, None] / power[:, None, :]
 
 
-def test_the_expectation_is_the_sum_of_plane_waves():
+def test_the_expectation_is_the_sum_of_plane_waves_and_a_ship_that_passes_is_louder():
     config, spectra = drawn(100_000)
     assert spectra.frequency == pytest.approx(np.arange(160.0, 901.0, 20.0))
     R = expected(spectra.frequency, config, *LAYERS)
-    off = relative(spectra.csdm, R)
     # Each element has a standard deviation of 1 / sqrt(100,000) = 0.0032.
-    assert np.abs(off).max() < 5.0 * 0.0032
+    assert np.abs(relative(spectra.csdm, R)).max() < 5.0 * 0.0032
     without = expected(spectra.frequency, config, LAYERS[0] + 1.0, LAYERS[1])
     assert np.abs(relative(spectra.csdm, without)).max() > 10.0 * 0.0032
+    _, loud = drawn(100_000, ship_pass=(0, 3))  # a hundred times
+    R = expected(spectra.frequency, config, *LAYERS, ships=False)
+    ratio = np.mean(np.abs(loud.csdm - R)) / np.mean(np.abs(spectra.csdm - R))
+    assert ratio == pytest.approx(100.0, rel=0.03)
 
 
 @pytest.mark.parametrize('snapshots', [3, 5, 64])
@@ -199,51 +193,35 @@ def test_a_draw_scatters_as_an_average_of_that_many_snapshots(snapshots):
     assert np.mean(squares) * snapshots == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_ship_that_passes_is_a_hundred_times_louder():
-    config, quiet = drawn(100_000)
-    _, loud = drawn(100_000, ship_pass=(0, 3))
-    R = expected(quiet.frequency, config, *LAYERS, ships=False)
-    ratio = np.mean(np.abs(loud.csdm - R)) / np.mean(np.abs(quiet.csdm - R))
-    assert ratio == pytest.approx(100.0, rel=0.03)
-
-
 def test_pressure_has_the_spectra_of_the_plane_waves():
     """Estimated by scipy from the time series, from dozens of waves."""
-    config = scenario(
-        'pressure',
-        {
-            'phones': 4, 'element_spacing': 0.5, 'sample_rate': 4000.0, 'frequency_max': 1000.0,
-            'records': 1, 'record_seconds': 9.8, 'whitened': False, 'array_depth_std': 0.0,
-            'phone_noise': 0.01, 'first_depth': 45.0, 'layers': 1, 'ship_noise': 0.0,
-        },
-    )  # fmt: skip
+    values = {
+        'phones': 4, 'element_spacing': 0.5, 'sample_rate': 4000.0, 'frequency_max': 1000.0,
+        'records': 1, 'record_seconds': 9.8, 'whitened': False, 'array_depth_std': 0.0,
+        'phone_noise': 0.01, 'first_depth': 45.0, 'layers': 1, 'ship_noise': 0.0,
+    }  # fmt: skip
+    config = scenario('pressure', values)
     scene = simulate(config, 3)
     p = np.concatenate([item.measurement.pressure for item in scene.measurements])
     assert p.shape == (round(9.8 * 4000.0), 4)
     height = scene.truth[0].depth - scene.measurements[0].measurement.reference_depth
     frequency = np.arange(100.0, 1000.0, 20.0)
     R = expected(frequency, config, height, scene.truth[0].amplitude, ships=False)
-    found = np.empty((4, 4, len(frequency)), complex)
-    for i in range(4):
-        for j in range(4):
-            # scipy conjugates the first of the two.
-            f, S = csd(p[:, j], p[:, i], fs=4000.0, nperseg=800, noverlap=400, detrend=False)
-            found[i, j] = S[np.searchsorted(f, frequency)]
+    # scipy conjugates the first of the two.
+    pairs, how = (p.T[None, :], p.T[:, None]), {'nperseg': 800, 'noverlap': 400, 'detrend': False}
+    f, found = csd(*pairs, fs=4000.0, **how)
+    found = np.moveaxis(found, -1, 0)[np.searchsorted(f, frequency)]
     # Level: a two-sided spectrum of unit variance has the one-sided density 2 / fs.
-    off = relative(np.moveaxis(found, -1, 0) * 4000.0 / 2.0, R)
+    off = relative(found * 4000.0 / 2.0, R)
     # About 70 independent segments: 0.12 in each element.
-    assert np.sqrt(np.mean(np.abs(off) ** 2)) < 0.2
-    assert np.abs(off.mean(axis=0)).max() < 0.1
+    assert np.sqrt(np.mean(np.abs(off) ** 2)) < 0.2 and np.abs(off.mean(axis=0)).max() < 0.1
 
 
 # -- drift ----------------------------------------------------------------------------------------
 
 
 def test_the_array_heaves_and_its_depth_is_told_with_an_error():
-    config = scenario(
-        'drift', {'records': 720, 'heave': 4.0, 'heave_records': 90.0, 'array_depth_std': 0.2}
-    )
-    drift = drift_of(config, np.random.default_rng(1))
+    drift = drifted(1, records=720, heave=4.0, heave_records=90.0, array_depth_std=0.2)
     assert drift.array_depth.mean() == pytest.approx(73.5, abs=1e-6)
     assert np.ptp(drift.array_depth) == pytest.approx(8.0, abs=0.02)
     np.testing.assert_allclose(drift.array_depth[90:], drift.array_depth[:-90], atol=1e-9)
@@ -252,37 +230,31 @@ def test_the_array_heaves_and_its_depth_is_told_with_an_error():
 
 
 def test_layers_wander_together_and_alone_as_told():
-    def walked(**walks):
-        config = scenario('drift', {'records': 4000, 'appearing': (), **walks})
-        return np.diff(drift_of(config, np.random.default_rng(2)).depth, axis=0)
-
-    steps = walked(depth_walk=0.03, tilt_walk=0.0)
-    assert steps.std() == pytest.approx(0.03, rel=0.03)
-    assert np.abs(np.corrcoef(steps.T) - np.eye(8)).max() < 0.08
-    steps = walked(depth_walk=0.0, tilt_walk=0.05)
-    assert steps.std() == pytest.approx(0.05, rel=0.05)
-    np.testing.assert_allclose(steps, steps[:, :1] @ np.ones((1, 8)), atol=1e-12)
+    alone, together = (
+        np.diff(drifted(2, records=4000, appearing=(), depth_walk=d, tilt_walk=t).depth, axis=0)
+        for d, t in ((0.03, 0.0), (0.0, 0.05))
+    )
+    assert alone.std() == pytest.approx(0.03, rel=0.03)
+    assert np.abs(np.corrcoef(alone.T) - np.eye(8)).max() < 0.08
+    assert together.std() == pytest.approx(0.05, rel=0.05)
+    np.testing.assert_allclose(together, together[:, :1] @ np.ones((1, 8)), atol=1e-12)
 
 
 def test_the_truth_names_what_is_there():
-    changes = {'records': 40, 'appearing': (20,), 'fading': (5,)}
-    scene = simulate(scenario('drift_traces', changes), 1)
+    scene = made('drift_traces', 1, records=40, appearing=(20,), fading=(5,))
     first, middle, last = (scene.truth[k] for k in (0, 15, 39))
     assert first.track_id.tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
     assert len(middle.track_id) == 7 and set(middle.track_id) < set(first.track_id)
     assert last.track_id[-1] == 9 and len(last.track_id) == 8
-    assert [item.stamp_ns for item in scene.truth] == [
-        item.measurement.stamp_ns for item in scene.measurements
-    ]
-    steps = np.diff([item.stamp_ns for item in scene.truth])
-    np.testing.assert_allclose(steps, 89.6e9, atol=1.0)
+    stamps = [item.stamp_ns for item in scene.truth]
+    assert stamps == [item.measurement.stamp_ns for item in scene.measurements]
+    np.testing.assert_allclose(np.diff(stamps), 89.6e9, atol=1.0)
 
 
 def test_a_profiler_hears_its_own_noise_alone_where_there_is_no_floor():
-    config = scenario('diffuse', {'records': 1})
-    drift = drift_of(config, np.random.default_rng(0))
+    config, drift = scenario('diffuse', {'records': 1}), drifted(0, 'diffuse', records=1)
     bare = evolve(drift, amplitude=np.zeros_like(drift.amplitude))
     heard, silent = (
-        _envelope(config, each, 0, np.random.default_rng(1))[0] for each in (drift, bare)
+        simulator._envelope(config, each, 0, np.random.default_rng(1))[0] for each in (drift, bare)
     )
     assert silent.max() < 0.2 * heard.max() and len(silent) == len(heard)

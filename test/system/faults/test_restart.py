@@ -6,14 +6,18 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""A real node that is killed in the middle of its work goes on where it was saved last."""
+"""A real node that is killed in the middle of its work goes on where it was saved last.
+
+Only a process can be killed while it writes. That what was saved is all of a tracker is said of
+every recording by `trackers/test_state.py`, so the short form has one system.
+"""
 
 import itertools
 import time
 
 from helpers.estimates import same
 from helpers.faults.cases import CASES
-from helpers.faults.figures import count
+from helpers.faults.figures import count, long_form
 from helpers.faults.rig import Rig, without_shared_memory
 import numpy as np
 import pytest
@@ -71,19 +75,16 @@ def killed(case, arguments, path, messages, at_once, rng):
     return estimates
 
 
-@pytest.fixture
-def undisturbed(system, figures):
-    """A node that nobody kills."""
+@pytest.mark.parametrize('system', CASES if long_form() else ['diver'])
+def test_a_node_that_is_killed_goes_on_with_ids_and_covariances(system, tmp_path, figures):
     figures.skip_if_measured(TURNS, system=system)
-    with Rig(CASES[system]) as rig:
-        yield rig
-
-
-@pytest.mark.parametrize('system', CASES)
-def test_a_node_that_is_killed_goes_on_with_ids_and_covariances(
-    system, tmp_path, figures, undisturbed
-):
     case, rng = CASES[system], np.random.default_rng(4)
+    with Rig(case) as undisturbed:
+        killed_and_started_again(case, rng, tmp_path, figures, undisturbed)
+
+
+def killed_and_started_again(case, rng, tmp_path, figures, undisturbed):
+    system = case.system
     messages = messages_of(case)
     again = round(AGAIN * len(messages))
     given, equal, forgotten, wrong = 0, 0, 0, []

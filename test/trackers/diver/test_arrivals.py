@@ -6,44 +6,37 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The tracker on raw arrival times: echoes, tags that emit alone, instruments that are off."""
+"""The tracker on raw arrival times: echoes, tags that emit alone, instruments that are off, stamps
+that are rounded."""
 
 from attrs import evolve
-from helpers.diver_runs import arrivals, errors, fix, run, SECOND
+from helpers.diver_runs import arrivals, errors, fix, followed, miss, numbers_of, run, SECOND
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
 from sonar_imm.measurements import RelativeFix, VesselPose
 from sonar_imm.trackers.diver import estimate, offsets
+from sonar_imm.trackers.diver.arrival_stamps import ArrivalStamps, Resolution
 from sonar_imm.trackers.diver.instruments import Instruments, MOST_RECEIVERS
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.offsets import BiasTest, chi2_limit, RecentPairs
-from sonar_imm.trackers.diver.scan import ping_measurements
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate
 
 
 @pytest.mark.statistics
 def test_arrivals_are_better_than_fixes_made_of_them():
-    squared = {'arrivals': [], 'multistatic_fixes': []}
-    for sensor, found in squared.items():
-        changes = {'sensor': sensor, 'outlier_probability': 0.0, 'duration': 60.0}
+    rmse = {}
+    for sensor in ('arrivals', 'multistatic_fixes'):
+        changes, found = {'sensor': sensor, 'outlier_probability': 0.0, 'duration': 60.0}, []
         for seed in range(4):
             scene = simulate(scenario('multistatic', changes), seed)
             tracker = DiverTracker(DiverConfig(max_tracks=1))
             made = run(tracker, [item.measurement for item in scene.measurements])
-            error, _ = errors(made, scene.truth[0])
-            found += np.sum(error**2, axis=1).tolist()
-    rmse = {sensor: np.sqrt(np.mean(found)) for sensor, found in squared.items()}
-    assert rmse['arrivals'] < rmse['multistatic_fixes']
-    assert rmse['arrivals'] < 0.35
-
-
-def tag_ping(second, position, rng, receivers=RECEIVERS, emitted=0.123, std=1e-4):
-    distance = np.linalg.norm(np.append(position, 0.0) - receivers, axis=1)
-    n = len(receivers)
-    toa = emitted + distance / 1500.0 + std * rng.normal(size=n)
-    return arrivals(round(second * SECOND), receivers, toa, var_toa=std**2)
+            found += errors(made, scene.truth[0])[:, 0].tolist()
+        rmse[sensor] = np.sqrt(np.mean(np.square(found)))
+    assert rmse['arrivals'] < min(rmse['multistatic_fixes'], 0.35)
 
 
 def test_a_tag_of_unknown_emission_time_is_followed_also_by_two_receivers():
@@ -51,62 +44,52 @@ def test_a_tag_of_unknown_emission_time_is_followed_also_by_two_receivers():
     rng = np.random.default_rng(6)
     tracker = DiverTracker(DiverConfig(max_tracks=1))
     for second in range(1, 60):
-        position = np.array([0.6 * second - 20.0, 30.0])
+        place = np.array([0.6 * second - 20.0, 30.0])
         rx = RECEIVERS if second < 25 or second % 3 == 0 else RECEIVERS[[1, 2]]
-        estimate = tracker.process(tag_ping(second, position, rng, rx, rng.uniform(0, 5)))[-1]
-    assert np.hypot(*(estimate.state[0, :2] - position)) < 1.0
+        toa = rng.uniform(0, 5) + np.linalg.norm([*place, 0.0] - rx, axis=1) / SPEED
+        toa += 1e-4 * rng.normal(size=len(rx))
+        (estimate,) = tracker.process(arrivals(second * SECOND, rx, toa))
+    assert miss(estimate, place)[0] < 1.0
     assert estimate.extras['track_id'].tolist() == [1]
     assert tracker.health()['confirmed'] == 1
 
 
-def many_receivers(
-    turn, elevation=False, scale=1.0, passive=False, seconds=range(1, 40), **parameters
-):
-    """The estimates of a diver heard by eight receivers, with bearings, or elevations and a state
-    of depth; the scene turned about the first one by `turn` rad. The stated variances are those
-    of the errors divided by `scale`."""
+def many_receivers(turn, angles, passive=False, seconds=range(1, 40), **parameters):
+    """The estimates of a diver heard by eight receivers, who measure bearings, elevations (then
+    he is deeper) or no angles, and where he is; turned about the first receiver by `turn` rad."""
     rng = np.random.default_rng(21)
-    angle = 2.0 * np.pi * np.arange(7) / 7.0
-    rx = np.vstack([[0.0, 0.0], 60.0 * np.column_stack([np.cos(angle), np.sin(angle)])])
+    around = 2.0 * np.pi * np.arange(7) / 7.0
+    rx = np.vstack([[0.0, 0.0], 60.0 * np.column_stack([np.cos(around), np.sin(around)])])
     R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     rx = np.column_stack([rx @ R.T, np.full(8, -2.0)])
-    tx = np.full(3, np.nan) if passive else rx[0]
-    tracker, estimates, divers = DiverTracker(DiverConfig(max_tracks=1, **parameters)), [], []
-    none = np.full(8, np.nan)
+    none, pings, divers = np.full(8, np.nan), [], []
     for second in seconds:
-        diver = np.append(R @ [70.0, 0.6 * second - 12.0], -9.0 if elevation else -2.0)
+        diver = np.append(R @ [70.0, 0.6 * second - 12.0], -9.0 if angles == 'elevation' else -2.0)
         leg = diver - rx
-        r = np.linalg.norm(leg, axis=1)
-        path = r + (0.0 if passive else np.linalg.norm(diver - rx[0]))
-        path = path + 0.15 * rng.normal(size=8)
+        path = np.linalg.norm(leg, axis=1) + 0.15 * rng.normal(size=8)
+        path = path + (0.0 if passive else np.linalg.norm(diver - rx[0]))
         bearing = np.arctan2(leg[:, 1], leg[:, 0]) + 0.02 * rng.normal(size=8)
         up = np.arctan2(leg[:, 2], np.hypot(leg[:, 0], leg[:, 1])) + 0.02 * rng.normal(size=8)
-        ping = arrivals(
-            second * SECOND,
-            rx,
-            path / 1500.0,
-            tx=tx,
-            var_toa=(0.15 / 1500.0) ** 2 / scale,
-            bearing=none if elevation or scale != 1.0 else (bearing + np.pi) % (2 * np.pi) - np.pi,
-            var_bearing=0.02**2,
-            elevation=up if elevation else none,
-            var_elevation=np.full(8, 0.02**2),
-        )
-        estimates.append(tracker.process(ping)[-1])
+        bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
+        known = {'tx': np.full(3, np.nan) if passive else rx[0], 'var_toa': (0.15 / SPEED) ** 2}
+        known |= {'bearing': bearing if angles == 'bearing' else none, 'var_bearing': 0.02**2}
+        known |= {'elevation': up if angles == 'elevation' else none}
+        known |= {'var_elevation': np.full(8, 0.02**2)}
+        pings.append(arrivals(second * SECOND, rx, path / SPEED, **known))
         divers.append(diver)
-    return estimates, np.array(divers), tracker.health()
+    return followed(DiverTracker(DiverConfig(max_tracks=1, **parameters)), pings), divers
 
 
 @pytest.mark.parametrize('passive', [False, True])
 def test_bearings_of_many_receivers_across_half_a_turn_are_bearings(passive):
     """Heavy tails; turned by pi, the diver crosses where bearings jump from pi to -pi."""
-    depth = {'target_z': -2.0, 'adaptation': 'fixed', 'passive': passive, 'seconds': range(9, 25)}
-    plain, divers, _ = many_receivers(0.0, **depth)
-    other, turned, _ = many_receivers(np.pi, **depth)
-    for item, two, diver in zip(plain[5:], other[5:], turned[5:]):
+    scene = {'angles': 'bearing', 'passive': passive, 'seconds': range(9, 25)}
+    scene |= {'target_z': -2.0, 'adaptation': 'fixed'}
+    (plain, _), (other, divers) = (many_receivers(turn, **scene) for turn in (0.0, np.pi))
+    for item, two, diver in zip(plain[5:], other[5:], divers[5:]):
         assert two.state[0, :2] == pytest.approx(-item.state[0, :2], abs=1e-5)
         assert two.extras['nis_dof'].tolist() == item.extras['nis_dof'].tolist()
-        assert np.hypot(*(two.state[0, :2] - diver[:2])) < 0.6
+        assert miss(two, diver[:2])[0] < 0.6
     with_bearing = np.mean([item.extras['nis_dof'][0] for item in plain[5:]])
     assert with_bearing > (7 if passive else 8)  # more than the arrival times alone
 
@@ -115,14 +98,14 @@ def test_bearings_of_many_receivers_across_half_a_turn_are_bearings(passive):
 def test_elevations_show_the_depth():
     """Two hundredths of a radian at 70 m are 1.4 m a receiver, and eight of them hear it."""
     exact = {'dimensions': 3, 'systematic_errors': 'exact'}
-    seen, divers, _ = many_receivers(0.0, elevation=True, **exact)
-    error = np.array([item.state[0, :3] - diver for item, diver in zip(seen, divers)])[5:]
-    P = np.array([item.covariance[0, :3, :3] for item in seen])[5:]
-    nees = np.einsum('ka,ka->k', error, np.linalg.solve(P, error[..., None])[..., 0])
-    assert np.sqrt(np.mean(error[:, 2] ** 2)) < 0.5
-    assert np.sqrt(P[-1, 2, 2]) < 0.6 and 1.0 < nees.mean() < 6.0
-    unheard, _, _ = many_receivers(0.0, elevation=False, scale=1.01, **exact)
-    assert np.sqrt(unheard[-1].covariance[0, 2, 2]) > 1.5 * np.sqrt(P[-1, 2, 2])
+    seen, divers = many_receivers(0.0, 'elevation', **exact)
+    z = np.array([item.state[0, 2] - diver[2] for item, diver in zip(seen, divers)])[5:]
+    nees = np.mean([miss(item, diver)[1] for item, diver in zip(seen, divers)][5:])
+    variance = seen[-1].covariance[0, 2, 2]
+    assert np.sqrt(np.mean(z**2)) < 0.5
+    assert np.sqrt(variance) < 0.6 and 1.0 < nees < 6.0
+    unheard, _ = many_receivers(0.0, None, **exact)
+    assert np.sqrt(unheard[-1].covariance[0, 2, 2]) > 1.5 * np.sqrt(variance)
 
 
 def test_echoes_of_two_divers_at_each_receiver_are_told_apart():
@@ -135,10 +118,9 @@ def test_echoes_of_two_divers_at_each_receiver_are_told_apart():
         path = np.linalg.norm(divers, axis=1)[:, None] + reach
         order = rng.permutation(10)
         receiver = np.tile(np.arange(5), 2)[order]
-        toa = path.ravel()[order] / 1500.0 + 1e-4 * rng.normal(size=10)
+        toa = path.ravel()[order] / SPEED + 1e-4 * rng.normal(size=10)
         known = {'rx_id': receiver, 'tx': np.zeros(3)}
-        ping = arrivals(second * SECOND, receivers[receiver], toa, **known)
-        estimate = tracker.process(ping)[-1]
+        (estimate,) = tracker.process(arrivals(second * SECOND, receivers[receiver], toa, **known))
     confirmed = estimate.state[estimate.extras['track_state'] > 0, :2]
     assert len(confirmed) == 2
     for diver in divers:
@@ -148,10 +130,13 @@ def test_echoes_of_two_divers_at_each_receiver_are_told_apart():
 # A sensor whose bearings are all off by some degrees: its mount, its heading or its compass.
 
 
-STD = np.radians(2.0)
+STD, TOA_STD, SPEED = np.radians(2.0), 2e-4, 1500.0
 EVERYWHERE = (0.0, 0.0, 0.0, 360.0, 0.0, 1e6)
 """A coverage that says no more than that the sensor stands at the origin."""
 SINGLE = {'max_tracks': 1, 'model_set': 'linear', 'coverage_sector': EVERYWHERE}
+
+
+CALM = {'max_tracks': 1, 'model_set': 'linear', 'acceleration_noise': (0.02,)}
 
 
 def path(count=40):
@@ -163,8 +148,7 @@ def path(count=40):
 
 def last(config, measurements):
     tracker = DiverTracker(DiverConfig(**config))
-    made = [each for item in measurements for each in tracker.process(item)]
-    return made[-1], tracker._stream.state
+    return run(tracker, measurements)[-1], tracker._stream.state
 
 
 def test_positions_as_a_sensor_shows_them_are_turned_about_it_and_back():
@@ -215,8 +199,9 @@ def test_a_considered_bearing_widens_the_ellipse_across_and_moves_no_estimate(as
 
 def test_where_nobody_knows_where_a_sensor_stands_nothing_is_added():
     config = {'max_tracks': 1, 'model_set': 'linear'}
-    plain, _ = last(config, path())
-    same, _ = last({**config, 'bearing_bias_std_deg': 2.0}, path())
+    plain, same = (
+        last({**config, **more}, path())[0] for more in ({}, {'bearing_bias_std_deg': 2})
+    )
     np.testing.assert_array_equal(same.covariance, plain.covariance)
 
 
@@ -224,45 +209,35 @@ def around_a_diver(off):
     """A diver who lies still, seen from a vessel that circles, its transceiver `off` rad off."""
     rng, where, made = np.random.default_rng(5), np.array([10.0, 5.0, 0.0]), []
     turn = np.array([[np.cos(off), -np.sin(off), 0.0], [np.sin(off), np.cos(off), 0.0], [0, 0, 1]])
+    pose = {'orientation': (0.0, 0.0, 0.0, 1.0), 'frame_id': 'map'}
+    pose |= {'pose_covariance': np.diag([0.01] * 3 + [1e-8] * 3)}
     for k in range(1, 90):
-        angle = 2.0 * np.pi * k / 60.0
+        angle, now = 2.0 * np.pi * k / 60.0, {'stamp_ns': k * SECOND}
         vessel = 40.0 * np.array([np.cos(angle), np.sin(angle), 0.0])
-        made.append(
-            VesselPose(
-                stamp_ns=k * 10**9, position=vessel, orientation=(0.0, 0.0, 0.0, 1.0),
-                pose_covariance=np.diag([0.01] * 3 + [1e-8] * 3), frame_id='map',
-            )
-        )  # fmt: skip
+        made.append(VesselPose(position=vessel, **pose, **now))
         seen = turn @ (where - vessel) + 0.3 * rng.normal(size=3)
-        made.append(
-            RelativeFix(stamp_ns=k * 10**9, offset=seen, covariance=0.09 * np.eye(3), target_id=1)
-        )
+        made.append(RelativeFix(offset=seen, covariance=0.09 * np.eye(3), target_id=1, **now))
     return made, where
 
 
 def test_a_vessel_that_moves_tells_how_its_transceiver_is_turned():
     off = np.radians(4.0)
     measured, where = around_a_diver(off)
-    config = {'max_tracks': 1, 'model_set': 'linear', 'acceleration_noise': (0.02,)}
-    ignored, _ = last(config, measured)
-    stated = {'bearing_bias_std_deg': 3.0, 'systematic_errors': 'estimate'}
-    found, known = last({**config, **stated}, measured)
+    ignored, _ = last(CALM, measured)
+    stated = {**CALM, 'bearing_bias_std_deg': 3.0}
+    found, known = last({**stated, 'systematic_errors': 'estimate'}, measured)
     assert abs(known.rows.blocks[0].x[0, 4, 0] - off) < np.radians(0.6)
-    error = [np.hypot(*(each.state[0, :2] - where[:2])) for each in (ignored, found)]
-    assert error[1] < 0.3 * error[0]
-    considered, _ = last({**config, 'bearing_bias_std_deg': 3.0}, measured)
-    miss = considered.state[0, :2] - where[:2]
-    assert miss @ np.linalg.solve(considered.covariance[0, :2, :2], miss) < 6.0
+    assert miss(found, where[:2])[0] < 0.3 * miss(ignored, where[:2])[0]
+    considered, _ = last(stated, measured)
+    assert miss(considered, where[:2])[1] < 6.0
 
 
 def test_a_sonar_of_range_and_bearing_states_what_its_mount_does():
-    """One receiver at the transmitter: what it hears is a range and a bearing."""
     place, here = np.array([30.0, 40.0, 0.0]), np.zeros((1, 3))
     seen = {'tx': here, 'bearing': np.arctan2(40.0, 30.0), 'var_bearing': np.radians(1.0) ** 2}
-    pings = [arrivals(k * 10**9, here, [100.0 / 1500.0], rx_id=[1], **seen) for k in range(1, 30)]
-    config = {'max_tracks': 1, 'model_set': 'linear', 'acceleration_noise': (0.02,)}
-    plain, _ = last(config, pings)
-    wide, known = last({**config, 'bearing_bias_std_deg': 2.0}, pings)
+    pings = [arrivals(k * SECOND, here, [100.0 / SPEED], rx_id=[1], **seen) for k in range(1, 30)]
+    plain, _ = last(CALM, pings)
+    wide, known = last({**CALM, 'bearing_bias_std_deg': 2.0}, pings)
     across = np.array([-0.8, 0.6])
     assert across @ plain.covariance[0, :2, :2] @ across < 0.5
     assert across @ wide.covariance[0, :2, :2] @ across > 0.9 * (50.0 * STD) ** 2
@@ -285,21 +260,15 @@ def test_instruments_beyond_the_most_are_taken_as_they_are():
 @pytest.mark.statistics
 def test_the_covariance_of_a_turned_sonar_is_true():
     nees = {0.0: [], 2.0: []}
+    scene = scenario('random_heading', {'duration': 60.0, 'bearing_bias_std_deg': 2.0})
     for seed in range(6):
-        made = simulate(
-            scenario('random_heading', {'duration': 60.0, 'bearing_bias_std_deg': 2.0}), seed
-        )
-        track = made.truth[0]
+        made = simulate(scene, seed)
         for stated, found in nees.items():
-            config = DiverConfig(
-                max_tracks=1, coverage_sector=EVERYWHERE, bearing_bias_std_deg=stated
-            )
-            tracker = DiverTracker(config)
-            for k, item in enumerate(made.measurements):
-                estimate = tracker.process(item.measurement)[-1]
-                if k >= 10 and len(estimate):
-                    error = estimate.state[0, :2] - track.position[k, :2]
-                    found.append(error @ np.linalg.solve(estimate.covariance[0, :2, :2], error))
+            config = {'coverage_sector': EVERYWHERE, 'bearing_bias_std_deg': stated}
+            tracker = DiverTracker(DiverConfig(max_tracks=1, **config))
+            estimates = followed(tracker, [item.measurement for item in made.measurements])
+            places = made.truth[0].position[:, :2]
+            found += [miss(*pair)[1] for pair in zip(estimates[10:], places[10:]) if len(pair[0])]
     assert np.mean(nees[0.0]) > 3.5 > 2.6 > np.mean(nees[2.0])
 
 
@@ -309,7 +278,6 @@ def test_the_place_of_a_sensor_is_part_of_what_a_fix_is():
     assert plain.key() != placed.key() and plain.key() == evolve(plain).key()
 
 
-TOA_STD, SPEED = 2e-4, 1500.0
 EVERY = 'every'
 
 
@@ -321,23 +289,20 @@ def legs(place, tag=False):
 def ping_of(place, tag=False, error=0.0, rows=slice(None)):
     """The arrivals of a diver at `place` (2,) at the receivers `rows`, with errors (4,), m."""
     toa = (legs(place, tag) + error)[rows] / SPEED
-    known = {
-        'rx_id': np.arange(4)[rows],
-        'tx': [np.nan if tag else 0.0] * 3,
-        'var_toa': TOA_STD**2,
-    }
-    return arrivals(1, RECEIVERS[rows], toa, tx_id=np.ones(len(toa)), **known)
+    known = {'tx': [np.nan if tag else 0.0] * 3, 'var_toa': TOA_STD**2}
+    return arrivals(
+        1, RECEIVERS[rows], toa, tx_id=np.ones(len(toa)), rx_id=np.arange(4)[rows], **known
+    )
 
 
-def evidence(places, received, errors, tag=False, **stated):
+def evidence(places, received, errors, tag=False):
     """The evidence of pings of a diver at `places` (k, 2) whose arrivals, those that were `heard`
     (k, 4), have the errors (k, 4), m of path."""
-    config = DiverConfig(**stated)
-    models, found = build_models(config), BiasTest()
-    layout = Instruments().layout(config, models)
+    config, found = DiverConfig(), BiasTest()
+    models = build_models(config)
     for place, rows, error in zip(places, received, errors):
         ping = ping_of(place, tag, error, rows)
-        seen = ping_measurements(ping, np.arange(len(ping)), config, models, layout)
+        seen = numbers_of(ping, config, models)
         ids = np.column_stack([ping.tx_id, ping.rx_id]).astype(np.int64)
         found = found.with_ping(seen, seen.echo, ids, place + [0.3, -0.2], config)
     return found, config
@@ -393,8 +358,7 @@ def test_noise_alone_is_no_evidence_even_where_more_of_it_than_stated():
 
 def test_what_is_stated_of_instruments_is_expected_and_no_more():
     places, received, noise = scene()
-    late = noise + np.array([0.0, 0.8, -0.5, 0.3])
-    found, config = evidence(places, received, late)
+    found, config = evidence(places, received, noise + np.array([0.0, 0.8, -0.5, 0.3]))
     (warning,) = found.warnings(config)
     assert 'receiver_clock_std' in warning and 'target_z' in warning
     assert found.warnings(DiverConfig(receiver_clock_std=5e-4)) == []
@@ -420,12 +384,10 @@ def test_a_single_cause_that_explains_it_all_is_named():
 
 def heard(config, place, tag=False):
     """The pairs heard in one ping, all of whose echoes were taken, of a diver at `place` (2,)."""
-    models, everyone = build_models(config), np.ones(4, bool)
-    ping, layout = ping_of(place, tag), Instruments().layout(config, models)
-    seen = ping_measurements(ping, np.arange(4), config, models, layout)
-    at = np.asarray(place, float)
-    nothing = BiasTest(), RecentPairs()
-    return offsets.accumulate_residuals(*nothing, {0: at}, {0: everyone}, ping, seen, config)[1]
+    ping, nothing = ping_of(place, tag), (BiasTest(), RecentPairs())
+    seen = numbers_of(ping, config, build_models(config))
+    taken = {0: np.asarray(place, float)}, {0: np.ones(4, bool)}
+    return offsets.accumulate_residuals(*nothing, *taken, ping, seen, config)[1]
 
 
 def placed(path, guess, receivers, tag):
@@ -460,16 +422,27 @@ def test_what_is_assumed_of_instruments_moves_the_place_of_a_ping_as_it_says(tag
     assert (wide[0, 2:] == 0.0).all()
 
 
+def test_of_a_tag_that_is_also_an_echo_the_better_pairs_say_where_it_is():
+    """One of the two by itself where the other one is heard a thousand times worse."""
+    config, place = DiverConfig(), np.array([20.0, 30.0])
+    tag, echo = (heard(config, place, each) for each in (True, False))
+    tag = tag._replace(pairs=tuple((2, receiver) for _, receiver in tag.pairs))
+    for good, bad in ((tag, echo), (echo, tag)):
+        bad = bad._replace(variance=1e6 * bad.variance)
+        parts = (np.concatenate(column) for column in zip(good[1:], bad[1:]))
+        both = RecentPairs(good.pairs + bad.pairs, *parts)
+        found, due = (each.assumed_covariance([*place, 0.0], 2, SPEED) for each in (both, good))
+        np.testing.assert_allclose(found, due, rtol=0.02, atol=0.02 * due.max())
+
+
 def test_nothing_is_assumed_where_something_is_stated_or_nobody_was_heard():
     mean, nothing = np.array([[20.0, 30.0, 0.0, 0.0]]), np.zeros((1, 4, 4))
     config = DiverConfig()
     found = heard(config, mean[0, :2])
     assert offsets.with_assumed_errors(RecentPairs(), mean, nothing, config) is nothing
-    exact = DiverConfig(systematic_errors='exact')
-    assert offsets.with_assumed_errors(found, mean, nothing, exact) is nothing
-    for name in offsets.STDS:
-        stated = DiverConfig(**{name: 1e-6})
-        assert offsets.with_assumed_errors(found, mean, nothing, stated) is nothing
+    for stated in ({'systematic_errors': 'exact'}, *({name: 1e-6} for name in offsets.STDS)):
+        config = DiverConfig(**stated)
+        assert offsets.with_assumed_errors(found, mean, nothing, config) is nothing
 
 
 def test_what_is_assumed_moves_no_estimate_and_ends_with_fixes():
@@ -489,11 +462,96 @@ def test_what_is_assumed_moves_no_estimate_and_ends_with_fixes():
 def test_pairs_that_fell_silent_are_forgotten():
     config, place = DiverConfig(), np.array([20.0, 30.0])
     found = heard(config, place)
-    nobody = found
-    for _ in range(offsets.RECENT):
-        nobody = nobody._replace(age=nobody.age + 1.0)
-    models = build_models(config)
-    layout = Instruments().layout(config, models)
-    seen = ping_measurements(ping_of(place, rows=[2]), np.arange(1), config, models, layout)
+    nobody = found._replace(age=found.age + float(offsets.RECENT))
+    seen = numbers_of(ping_of(place, rows=[2]), config, build_models(config))
     left = nobody.with_ping(seen, np.ones(1, bool), np.array([[1, 2]]))
     assert left.pairs == ((1, 2),) and len(found.pairs) == 4
+
+
+SQUARE = np.array([[0.0, 0.0, -2.0], [240.0, 0.0, -2.0], [240.0, 240.0, -2.0], [0.0, 240.0, -2]])
+
+
+def stamped(step, count=60, active=False):
+    """Pings of a tag, or echoes of a transmitter, whose times are multiples of `step` s (0: not),
+    and where the target is. The times of messages are on whole seconds."""
+    rng, n, known = np.random.default_rng(1), len(SQUARE), {'tx': SQUARE[0]} if active else {}
+    known |= {'tx_id': np.ones(n, int), 'rx_id': np.arange(1, n + 1)}
+    for k in range(count):
+        emitted = 100.0 + 3.7 * k + rng.uniform(0.0, 1.0)
+        place = np.array([90.0 + 0.4 * 3.7 * k, 100.0 + 20.0 * np.sin(k / 15), 0.0])
+        path = np.linalg.norm(SQUARE - place, axis=1)
+        path += active * np.linalg.norm(SQUARE[0] - place)
+        delay = path / 1500.0 + 1e-4 * rng.normal(size=n)
+        start = round(emitted * (1 if active else 1e9)) * (SECOND if active else 1)
+        at = np.round(delay * 1e9).astype(np.int64) + (0 if active else start)
+        if step:
+            at = np.round(at / (step * 1e9)).astype(np.int64) * round(step * 1e9)
+        stamp = start if active else int(at.min())
+        yield place[:2], arrivals(stamp, SQUARE, (at - (0 if active else stamp)) / 1e9, **known)
+
+
+def tracked(step, **how):
+    """Errors (n,), normalised ones, and the sentences about multiples of a run."""
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    places, pings = zip(*stamped(step, **how))
+    pairs = zip(followed(tracker, pings)[30:], places[30:])
+    off, nees = np.reshape([miss(*pair) for pair in pairs if len(pair[0])], (-1, 2)).T
+    return off, nees, said(tracker), tracker
+
+
+def said(tracker):
+    return [text for text in tracker.warnings() if 'multiples' in text]
+
+
+def test_the_resolution_is_that_of_an_independent_program():
+    v = load_vectors('diver_in_the_field/quantum')
+    found = [Resolution().after(stamps).seconds for stamps in v['stamps_ns']]
+    np.testing.assert_allclose(found, v['seconds'], rtol=1e-12)
+    assert Resolution().after(v['few']).seconds == v['few_seconds'] == 0.0
+
+
+def test_the_resolution_is_that_of_all_times_in_whatever_parts_they_come():
+    stamps = load_vectors('diver_in_the_field/quantum')['stamps_ns'][1]
+    known = Resolution()
+    for part in np.array_split(stamps, 9):
+        known = known.after(part)
+    assert known == Resolution().after(np.sort(stamps))._replace(values=known.values)
+    assert known.seconds == 0.1 and known.after(np.array([12_345_678_912])).seconds == 0.0
+    # Seconds since 1970 as a float are not exact; one delay again and again shows nothing.
+    rough = np.array([round((1.7e9 + 0.1 * k) % 1e6 * 1e9) + 119 for k in range(30)])
+    assert Resolution().after(rough).seconds == pytest.approx(0.1)
+    still = Resolution()
+    for _ in range(30):
+        still = still.after(np.array([80_000_000]))
+    assert still.seconds == 0.0
+
+
+@pytest.mark.parametrize('active', [False, True])
+def test_stamps_of_messages_on_whole_seconds_are_no_resolution(active):
+    known = ArrivalStamps()
+    for _, ping in stamped(0.0, active=active):
+        known = known.after(evolve(ping, stamp_ns=ping.stamp_ns // SECOND * SECOND))
+    assert known.resolution == 0.0 and 339.0 < known.span < 340.0
+
+
+@pytest.mark.parametrize('step, active', [(1e-3, True), (1e-2, False)])
+def test_rounding_is_counted_in(step, active):
+    _, squared, (sentence,), _ = tracked(step, active=active)
+    assert len(squared) > 25 and squared.mean() < 3.0 and (squared < 5.99).mean() > 0.85
+    assert f'multiples of {step:g} s: a resolution of {1500 * step:.3g} m' in sentence
+    assert f'toa_std raised to {step / 12**0.5:.2g} s' in sentence
+
+
+def test_no_position_is_had_of_whole_seconds():
+    _, _, (sentence,), tracker = tracked(1.0)
+    assert 'no position can be had of them' in sentence and '1.5e+03 m' in sentence
+    assert not (tracker._stream.state.life.status > 0).any()
+
+
+def test_what_is_stated_is_used_and_exact_times_say_nothing():
+    errors, squared, sentences, _ = tracked(0.0)
+    assert np.median(errors) < 0.5 and squared.mean() < 3.0 and not sentences
+    stated = np.full(len(SQUARE), np.float32(1e-6 / 12.0), np.float64)  # as who knows states it
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    followed(tracker, [evolve(ping, var_toa=stated) for _, ping in stamped(1e-3)])
+    assert not said(tracker)

@@ -9,52 +9,35 @@
 """What passes between two records: missing ones, uneven stamps, and layers that dip."""
 
 from attrs import evolve
-from helpers.fathometer_runs import run
+from helpers.fathometer_runs import order_of, run
 import numpy as np
 import pytest
 
-from benchmarks.fathometer_sea import (
-    BEFORE,
-    DIPPING,
-    dipping,
-    kalman,
-    LAYERS,
-    scene,
-    SECONDS,
-    summary,
-    tracked,
-)
+from benchmarks import fathometer_sea as gaps
 from msg_adapters.displays.fathometer import Displays
 from msg_adapters.displays.tracks import MODELS
 from sonar_imm.measurements import GeodeticFix
+from sonar_imm.trackers.fathometer import slopes
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.pressure import CompanionPlaces, Pace
 from sonar_imm.trackers.fathometer.response import Lattice, MAX_MOVES
-from sonar_imm.trackers.fathometer.slopes import (
-    begun,
-    Common,
-    common_slope,
-    learned,
-    Slope,
-    walks_to,
-    ways,
-)
-from sonar_imm.trackers.fathometer.tracker import FathometerTracker, LONGEST_GAP
+from sonar_imm.trackers.fathometer.tracker import LONGEST_GAP
 
 OPTIONS = {'particles': 5000}
 
 
 @pytest.mark.statistics
-@pytest.mark.parametrize('gap', [10, 30])
-def test_after_a_gap_it_is_as_if_there_had_been_none(gap):
+def test_after_a_gap_it_is_as_if_there_had_been_none():
     """Beside a Kalman filter for each layer, which knows the echoes apart."""
-    runs, bounds = [], []
+    runs, bounds, gap = [], [], 30
     for seed in range(8):
-        traces, truth = scene(gap, 0.1, seed)
-        runs.append(tracked(traces, truth, **OPTIONS))
+        traces, truth = gaps.scene(gap, 0.1, seed)
+        runs.append(gaps.tracked(traces, truth, **OPTIONS))
         known = np.ones(truth.shape, int)
-        bounds.append({'right': known[:, 0], 'found': kalman(traces, truth, gap), 'ids': known})
-    found, bound = summary(runs), summary(bounds)
+        bounds.append(
+            {'right': known[:, 0], 'found': gaps.kalman(traces, truth, gap), 'ids': known}
+        )
+    found, bound = gaps.summary(runs), gaps.summary(bounds)
     assert found['P, 1st'] >= 0.75 and found['P, 2nd'] >= 0.875 and found['P, later'] >= 0.95
     assert found['found, 1st'] >= 0.95 and found['kept, 4th'] >= 0.95
     # 48 layers leave .03 of chance.
@@ -62,36 +45,36 @@ def test_after_a_gap_it_is_as_if_there_had_been_none(gap):
     assert found['error, 1st, m'] <= 1.5 * bound['error, 1st, m']
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_the_first_record_has_no_reflector_too_many(seed):
+def test_the_first_record_has_no_reflector_too_many():
     """Were every number equally probable before, most first records would have one."""
-    tracker, found = run(scene(0, 0.1, seed)[0][:1], particles=2000)
-    (estimate,) = found.values()
-    assert np.argmax(estimate.probabilities[0]) + 1 == len(LAYERS)
-    assert tracker.health()['effective_sample_size'] > 400.0
+    for seed in range(3):
+        tracker, found = run(gaps.scene(0, 0.1, seed)[0][:1], particles=2000)
+        assert [order_of(each) for each in found.values()] == [len(gaps.LAYERS)]
+        assert tracker.health()['effective_sample_size'] > 400.0
 
 
 def test_where_half_may_have_come_and_gone_the_set_begins_anew_and_names_stay():
-    """Followed over 120 missing records, one set of 2000 is left."""
-    traces, _ = scene(120, 0.1, 4)
-    tracker, found = run(traces[:BEFORE], particles=2000)
-    before = max(found.values(), key=lambda each: each.stamp_ns).extras['track_id']
-    tracker.process(traces[BEFORE])
+    """Followed over 120 missing records, one set of 2000 is left; after too long a gap all is
+    new."""
+    traces, _ = gaps.scene(120, 0.1, 4)
+    tracker, found = run(traces[: gaps.BEFORE], particles=2000)
+    before = set(newest(found).extras['track_id'])
+    tracker.process(traces[gaps.BEFORE])
     assert tracker.health()['effective_sample_size'] > 30.0
-    (estimate,) = tracker.process(traces[BEFORE + 1])
+    (estimate,) = tracker.process(traces[gaps.BEFORE + 1])
     assert (
-        len(estimate) == len(LAYERS) and len(set(before) & set(estimate.extras['track_id'])) >= 5
+        len(estimate) == len(gaps.LAYERS) and len(before & set(estimate.extras['track_id'])) >= 5
     )
-
-
-def test_after_too_long_a_gap_all_is_new():
-    traces, _ = scene(0, 0.1, 2)
-    tracker, found = run(traces[:10], max_gap=1e8, **OPTIONS)
-    before = max(found.values(), key=lambda each: each.stamp_ns).extras['track_id']
-    late = traces[10].stamp_ns + (LONGEST_GAP + 1) * 10 * 10**9
+    tracker, found = run(traces[:10], max_gap=1e8, particles=2000)
+    late = traces[9].stamp_ns + (LONGEST_GAP + 2) * 10 * 10**9
     (estimate,) = tracker.process(evolve(traces[10], stamp_ns=late))
-    assert not set(estimate.extras['track_id']) & set(before)
-    assert len(before) == len(LAYERS) and tracker.counts['gaps'] == 1
+    before = set(newest(found).extras['track_id'])
+    assert not before & set(estimate.extras['track_id'])
+    assert len(before) == len(gaps.LAYERS) and tracker.counts['gaps'] == 1
+
+
+def newest(found):
+    return found[max(found)]
 
 
 def passed(stamps, fixes=(), **parameters):
@@ -101,8 +84,7 @@ def passed(stamps, fixes=(), **parameters):
     for second, latitude, longitude in fixes:
         stamp_ns = round(second * 1e9)
         places.add(GeodeticFix(stamp_ns=stamp_ns, latitude=latitude, longitude=longitude))
-    for stamp in stamps:
-        stamp_ns = round(stamp * 1e9)
+    for stamp_ns in (round(stamp * 1e9) for stamp in stamps):
         place = places.at(stamp_ns, config)
         found.append(pace.records(stamp_ns, config, place))
         pace = pace.after(stamp_ns, place)
@@ -149,93 +131,77 @@ def test_by_distance_the_way_counts_and_not_the_time():
 
 def test_what_a_long_way_changes_is_expected_by_distance_only():
     """Records at even times, 30 records' way between two of them."""
-    traces, _ = scene(30, 0.1, 0)
-    right = {}
+    traces, _ = gaps.scene(30, 0.1, 0)
+    still = {'slope_std': 0.0, 'sound_speed_std': 0.0, **OPTIONS}
     for record_distance in (0.0, 5.0):
-        options = {'record_distance': record_distance, 'slope_std': 0.0, 'seed': 0, **OPTIONS}
-        tracker = FathometerTracker(FathometerConfig(sound_speed_std=0.0, **options))
-        found = []
+        items = []
         for k, trace in enumerate(traces):
-            stamp_ns = round((k + 1) * SECONDS * 1e9)
-            way = METRE * 5.0 * (k + 30 * (k >= BEFORE))
+            stamp_ns = round((k + 1) * gaps.SECONDS * 1e9)
+            way = METRE * 5.0 * (k + 30 * (k >= gaps.BEFORE))
             fix = GeodeticFix(stamp_ns=stamp_ns, latitude=0.0, longitude=way)
-            assert tracker.process(fix) == []
-            (estimate,) = tracker.process(evolve(trace, stamp_ns=stamp_ns))
-            found.append(np.argmax(estimate.probabilities[0]) + 1 == len(LAYERS))
-        right[record_distance] = np.array(found)
-        assert tracker.counts['positions'] == len(traces)
+            items += [fix, evolve(trace, stamp_ns=stamp_ns)]
+        tracker, found = run(items, record_distance=record_distance, **still)
+        right = np.array([order_of(found[stamp]) == len(gaps.LAYERS) for stamp in sorted(found)])
+        assert tracker.counts['positions'] == len(traces) and right[: gaps.BEFORE].mean() >= 0.9
         assert tracker.counts['gaps'] == (record_distance > 0.0)
-    assert right[0.0][:BEFORE].mean() >= 0.9 and not right[0.0][BEFORE : BEFORE + 2].any()
-    assert right[5.0].mean() >= 0.9 and right[5.0][BEFORE + 1 :].all()
+        if record_distance:
+            assert right[gaps.BEFORE + 1 :].all()
+        else:
+            assert not right[gaps.BEFORE : gaps.BEFORE + 2].any()
 
 
-@pytest.mark.parametrize(
-    'options',
-    [
-        {'heave': 'memory', 'array_depth_std': 0.1},
-        {'polarity': 'both'},
-        {'amplitude_memory': 0.9},
-        {'smoothing_lag': 2},
-    ],
-)
+@pytest.mark.parametrize('options', [{'heave': 'memory', 'array_depth_std': 0.1},
+                                     {'polarity': 'both', 'amplitude_memory': 0.9},
+                                     {'smoothing_lag': 2}])  # fmt: skip
 def test_every_kind_of_state_crosses_a_gap(options):
-    traces, truth = scene(10, 0.1, 3)
+    traces, truth = gaps.scene(10, 0.1, 3)
     tracker, found = run(traces, **options, **OPTIONS)
-    last = max(found.values(), key=lambda each: each.stamp_ns)
     assert tracker.counts['unexplained'] == 0 and tracker.counts['gaps'] == 1
-    assert len(last) == len(LAYERS)
-    assert last.state[:, 0] == pytest.approx(truth[-1], abs=0.3)
+    assert newest(found).state[:, 0] == pytest.approx(truth[-1], abs=0.3)
 
 
 CONFIG = FathometerConfig()
-MANY = {'particles': 4000}
 
 
 @pytest.mark.statistics
-@pytest.mark.parametrize(('kind', 'dip', 'gap'), [('parallel', 0.4, 0), ('parallel', 0.8, 0),
-                                                 ('turn', 0.4, 0), ('fan', 0.4, 0),
-                                                 ('parallel', 0.4, 30)])  # fmt: skip
-def test_layers_that_dip_are_followed_without_a_parameter(kind, dip, gap):
-    found = summary([tracked(*dipping(kind, dip, gap, seed), **MANY) for seed in range(3)])
+@pytest.mark.parametrize('layers', [('parallel', 0.8, 0), ('turn', 0.4, 0), ('fan', 0.4, 0),
+                                    ('parallel', 0.4, 30)])  # fmt: skip
+def test_layers_that_dip_are_followed_without_a_parameter(layers):
+    runs = [gaps.tracked(*gaps.dipping(*layers, seed), particles=4000) for seed in range(3)]
+    found = gaps.summary(runs)
     assert found['P, before'] >= 0.9 and found['P, later'] >= 0.9
     assert found['inside, before'] >= 0.93 and found['inside, after'] >= 0.93
-    assert found['named'] <= len(DIPPING) + 2.0 and found['kept, 4th'] >= 0.95
+    assert found['named'] <= len(gaps.DIPPING) + 2.0 and found['kept, 4th'] >= 0.95
     assert found['dipping'] > 0.9
 
 
 def test_layers_that_are_still_are_called_so():
-    traces, _ = dipping('parallel', 0.0, 0, 0)
-    _, found = run(traces, particles=2000)
-    last = max(found.values(), key=lambda each: each.stamp_ns)
-    assert len(last) == len(DIPPING) and last.extras['dipping'].mean() < 0.3
-    dips, _ = dipping('parallel', -0.2, 0, 0)
-    _, found = run(dips, particles=2000)
-    last = max(found.values(), key=lambda each: each.stamp_ns)
+    """Also beside the order, in displays."""
+    last = newest(run(gaps.dipping('parallel', 0.0, 0, 0)[0], particles=2000)[1])
+    assert len(last) == len(gaps.DIPPING) and last.extras['dipping'].mean() < 0.3
+    last = newest(run(gaps.dipping('parallel', -0.2, 0, 0)[0], particles=2000)[1])
     assert last.extras['dipping'].mean() > 0.9
     # A walk of .1 m over 30 records leaves .02 m.
     assert last.extras['slope'] == pytest.approx(-0.2, abs=0.1)
     off = (last.extras['slope'] + 0.2) / last.extras['slope_std']
     assert np.sqrt(np.mean(off**2)) < 2.5
-
-
-def test_still_or_dipping_is_shown_beside_the_order():
-    traces, _ = dipping('parallel', 0.2, 0, 0)
-    _, found = run(traces[:6], particles=500)
-    estimate = found[traces[5].stamp_ns]
-    drawn = dict(Displays().of(estimate, lambda message, /, **fields: fields, lambda topic: True))
+    drawn = dict(Displays().of(last, lambda message, /, **fields: fields, lambda topic: True))
     names, values = drawn[MODELS]['name'], drawn[MODELS]['position']
     assert names[-2:] == ['still', 'dipping'] and names[0] == 'order_1'
-    assert values[-1] == pytest.approx(estimate.extras['dipping'].mean())
+    assert values[-1] == pytest.approx(last.extras['dipping'].mean())
     assert values[-2] + values[-1] == pytest.approx(1.0)
+    for options in ({'slope_std': 0.0}, {'heave': 'independent'}):
+        found = run(gaps.dipping('parallel', 0.0, 0, 1)[0][:8], particles=500, **options)[1]
+        for each in found.values():
+            assert not each.extras['dipping'].any() and not each.extras['slope_std'].any()
 
 
-def followed(slopes, records, seed=0, config=CONFIG):
-    """What is known of a slope after changes of depth by `slopes` (T,) and a walk."""
-    rng = np.random.default_rng(seed)
-    slope = begun(Common(), 0.0, config)
-    for change in np.asarray(slopes)[:records]:
-        step = change + config.depth_std * rng.standard_normal()
-        slope = learned(slope, Common(), step, 0.0, 1, config)
+def followed(changes, seed=0):
+    """What is known of a slope after these changes of depth (T,) and a walk."""
+    rng, slope = np.random.default_rng(seed), slopes.begun(slopes.Common(), 0.0, CONFIG)
+    for change in changes:
+        step = change + CONFIG.depth_std * rng.standard_normal()
+        slope = slopes.learned(slope, slopes.Common(), step, 0.0, 1, CONFIG)
     return slope
 
 
@@ -244,50 +210,51 @@ def test_the_slope_is_that_of_a_kalman_filter_while_it_dips_for_sure():
     config = evolve(CONFIG, slope_switch_probability=1e-6)
     rng = np.random.default_rng(2)
     changes = 0.8 + 0.1 * rng.standard_normal(20)
-    slope = begun(Common(), 0.0, config)
+    slope = slopes.begun(slopes.Common(), 0.0, config)
     for change in changes:
-        slope = learned(slope, Common(), float(change), 0.0, 1, config)
+        slope = slopes.learned(slope, slopes.Common(), float(change), 0.0, 1, config)
     precision = 20 / 0.1**2 + 1 / 0.4**2
     assert slope.dipping == pytest.approx(1.0, abs=1e-3)
     assert slope.mean == pytest.approx(changes.sum() / 0.1**2 / precision, rel=1e-3)
     assert slope.variance == pytest.approx(1.0 / precision, rel=1e-2)
     # A gap says as much of the slope as its walk leaves.
-    after = learned(slope, Common(), 8.0, 0.0, 10, config)
+    after = slopes.learned(slope, slopes.Common(), 8.0, 0.0, 10, config)
     more = precision + 100 / (10 * 0.1**2)
     assert after.variance == pytest.approx(1.0 / more, rel=1e-2)
 
 
 def test_a_slope_begins_ends_and_turns():
-    down = followed(np.full(15, 0.4), 15)
-    assert down.dipping > 0.9 and down.mean == pytest.approx(0.4, abs=0.1)
-    flat = followed(np.append(np.full(15, 0.4), np.zeros(15)), 30)
-    assert flat.dipping < 0.6 and abs(flat.mean) < 0.1
-    up = followed(np.append(np.full(15, 0.4), np.full(6, -0.4)), 21)
-    assert up.dipping > 0.9 and up.mean == pytest.approx(-0.4, abs=0.12)
+    down, flat, back = np.full(15, 0.4), np.zeros(15), np.full(6, -0.4)
+    for more, mean, dips in (([], 0.4, True), (flat, 0.0, False), (back, -0.4, True)):
+        found = followed(np.append(down, more))
+        assert found.dipping > 0.9 if dips else found.dipping < 0.6
+        assert found.mean == pytest.approx(mean, abs=0.12)
 
 
 def test_parallel_layers_share_a_slope_and_others_do_not():
-    alike = [Slope(1.0, mean, 0.01) for mean in (0.38, 0.42, 0.4, 0.41, 0.39)]
-    common = common_slope(alike)
+    alike = [slopes.Slope(1.0, mean, 0.01) for mean in (0.38, 0.42, 0.4, 0.41, 0.39)]
+    common = slopes.common_slope(alike)
     assert common.mean == pytest.approx(0.4, abs=0.01) and common.dipping > 0.8
     assert np.sqrt(common.variance) < 0.1
-    apart = common_slope([Slope(1.0, mean, 1e-4) for mean in (0.1, 0.3, -0.2, 0.5, 0.4)])
+    apart = slopes.common_slope(
+        [slopes.Slope(1.0, mean, 1e-4) for mean in (0.1, 0.3, -0.2, 0.5, 0.4)]
+    )
     assert np.sqrt(apart.variance) > 0.2
     # Of one other, or of those that are still, nothing is known.
-    assert common_slope(alike[:1]).variance == np.inf
-    still = common_slope([Slope(0.02, 0.3, 0.01)] * 5)
+    assert slopes.common_slope(alike[:1]).variance == np.inf
+    still = slopes.common_slope([slopes.Slope(0.02, 0.3, 0.01)] * 5)
     assert still.variance == np.inf and still.dipping < 0.15
     # A new layer below layers that dip is expected to dip with them.
-    new = ways(begun(common, 0.0, CONFIG), common, 1, CONFIG)
+    new = slopes.ways(slopes.begun(common, 0.0, CONFIG), common, 1, CONFIG)
     assert new.mean[1] == pytest.approx(0.4, abs=0.03) and new.weight[1] > 0.8
     assert new.weight.sum() == pytest.approx(1.0)
 
 
 def test_walks_lead_where_slopes_do():
     lattice = Lattice(40.0, 1.0 / 64.0, 2000)
-    down, still = Slope(0.98, 0.8, 1e-4), Slope(0.05, 0.0, 0.01)
-    known = [(60.0, still, Common()), (50.0, down, Common())]
-    walks = walks_to(known, Common(), lattice, 1, CONFIG)
+    down, still = slopes.Slope(0.98, 0.8, 1e-4), slopes.Slope(0.05, 0.0, 0.01)
+    known = [(60.0, still, slopes.Common()), (50.0, down, slopes.Common())]
+    walks = slopes.walks_to(known, slopes.Common(), lattice, 1, CONFIG)
     assert walks.probability.sum(axis=1) == pytest.approx(1.0)
     assert walks.wide
 
@@ -300,14 +267,6 @@ def test_walks_lead_where_slopes_do():
     assert mean(60.2) == pytest.approx(0.0, abs=0.01)
     assert walks.kind[0] == 0 and walks.kind[640 + 30] == 0
     # However far a gap leads, tables stay as large as they may be.
-    far = walks_to(known, Common(), lattice, 3000, CONFIG)
+    far = slopes.walks_to(known, slopes.Common(), lattice, 3000, CONFIG)
     assert far.probability.shape[1] * lattice.cells <= MAX_MOVES + 4 * lattice.cells
     assert far.probability.sum(axis=1) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize('options', [{'slope_std': 0.0}, {'heave': 'independent'}])
-def test_where_no_slopes_are_followed_all_are_still(options):
-    traces, _ = dipping('parallel', 0.0, 0, 1)
-    _, found = run(traces[: BEFORE // 2], particles=500, **options)
-    for estimate in found.values():
-        assert not estimate.extras['dipping'].any() and not estimate.extras['slope_std'].any()

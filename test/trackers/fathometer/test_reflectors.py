@@ -11,36 +11,32 @@
 import itertools
 
 from attrs import evolve
-from helpers import fathometer_vectors
-from helpers.fathometer_runs import run
-from helpers.sea_scenes import sea_scene
+from helpers.fathometer_runs import near_true, run, sea_scene
+from helpers.vector_files import load_vectors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.stats import norm
 
+from sonar_imm.acoustics.fathometer import sediment_thickness
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimation.set_members import Members
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer import multiples
+from sonar_imm.trackers.fathometer import reflectors as verbs
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.multiples import Multiples, RECORDS, Seen, ways_above
-from sonar_imm.trackers.fathometer.reflectors import (
-    Identified,
-    Identities,
-    nearest_ids,
-    Reflectors,
-    reflectors_of,
-    relative_amplitude,
-    sediment_depths,
-)
+from sonar_imm.trackers.fathometer.reflectors import Identified, Identities, Reflectors
 from sonar_imm.trackers.fathometer.response import Lattice, pulse_of, Response
 from sonar_imm.trackers.fathometer.tracker import FathometerTracker
 
 
 def test_the_thickness_of_sediment_is_that_of_the_vectors():
-    assert fathometer_vectors.sediment() < 1e-9
+    v = load_vectors('fathometer_sea/sediment')
+    times, kinds = v['two_way_time_below_bottom'], zip(v['sound_speed'], v['gradient'])
+    found = [sediment_thickness(times, float(c), float(gradient)) for c, gradient in kinds]
+    assert np.array(found) == pytest.approx(v['thickness'], abs=1e-9)
 
 
 def reflectors(depth, is_bottom):
@@ -51,20 +47,19 @@ def reflectors(depth, is_bottom):
 
 def test_depths_below_the_bottom_are_those_of_the_sediment():
     config = FathometerConfig(sediment_sound_speed=1600.0, sediment_sound_speed_std=80.0)
-    depth, std = sediment_depths(reflectors([55.0, 60.0, 100.0], [0.2, 0.8, 0.0]), config)
+    depth, std = verbs.sediment_depths(reflectors([55.0, 60.0, 100.0], [0.2, 0.8, 0.0]), config)
     thickness = 40.0 * 1600.0 / 1500.0
     assert depth == pytest.approx([55.0, 60.0, 60.0 + thickness], abs=1e-12)
     assert std == pytest.approx([0.1, 0.1, np.hypot(0.1, 0.05 * thickness)])
     # Without a speed it is as the water.
-    depth, std = sediment_depths(reflectors([60.0, 100.0], [1.0, 0.0]), FathometerConfig())
+    depth, std = verbs.sediment_depths(reflectors([60.0, 100.0], [1.0, 0.0]), FathometerConfig())
     assert depth == pytest.approx([60.0, 100.0]) and std == pytest.approx([0.1, 0.1])
-    nothing = sediment_depths(reflectors([], []), FathometerConfig())
+    nothing = verbs.sediment_depths(reflectors([], []), FathometerConfig())
     assert [len(each) for each in nothing] == [0, 0]
 
 
 def layers(depths, amplitudes, records=4, reference_depth=25.0):
-    depth = np.arange(40.0, 72.0, 1.0 / 64.0)
-    pulse = band_pulse(50.0, 4000.0, 1500.0)
+    depth, pulse = np.arange(40.0, 72.0, 1.0 / 64.0), band_pulse(50.0, 4000.0, 1500.0)
     clean = sum(a * pulse(depth - z) for z, a in zip(depths, amplitudes))
     rng = np.random.default_rng(1)
     known = {'depth': depth, 'sigma': np.ones(len(depth)), 'reference_depth': reference_depth}
@@ -75,32 +70,30 @@ def layers(depths, amplitudes, records=4, reference_depth=25.0):
 
 def test_times_and_the_bottom_in_the_estimate():
     _, found = run(layers([47.0, 58.0], [20.0, 10.0]), particles=2000, sediment_sound_speed=1650.0)
-    last = found[4 * 10**9]
-    assert last.state[:, 0] == pytest.approx([47.0, 58.0], abs=0.05)
-    assert last.extras['two_way_time'] == pytest.approx(
-        2.0 * (last.state[:, 0] - 25.0) / 1500.0, abs=1e-12
-    )
-    assert last.extras['is_bottom'] == pytest.approx([1.0, 0.0], abs=0.02)
-    thickness = 1.1 * (last.state[1, 0] - last.state[0, 0])
-    assert last.extras['sediment_depth'][1] == pytest.approx(last.state[0, 0] + thickness)
-
-
-def test_without_an_array_depth_there_is_no_two_way_time():
-    _, found = run(layers([47.0], [20.0], reference_depth=None), particles=500)
-    assert all(np.isnan(each.extras['two_way_time']).all() for each in found.values())
+    last, extras = found[4 * 10**9], found[4 * 10**9].extras
+    z = last.state[:, 0]
+    assert z == pytest.approx([47.0, 58.0], abs=0.05)
+    assert extras['two_way_time'] == pytest.approx(2.0 * (z - 25.0) / 1500.0, abs=1e-12)
+    assert extras['is_bottom'] == pytest.approx([1.0, 0.0], abs=0.02)
+    assert extras['sediment_depth'][1] == pytest.approx(z[0] + 1.1 * (z[1] - z[0]))
+    # Without the depth of the array there is no two-way time; multiples need not be marked.
+    _, found = run(layers([47.0], [20.0], 2, None), particles=500, multiples='off')
+    for each in found.values():
+        assert np.isnan(each.extras['two_way_time']).all()
+        assert np.isnan(each.extras['multiple_probability']).all()
 
 
 @pytest.mark.parametrize('column', ['amplitude', 'sigma'])
 def test_traces_beyond_numbers_are_refused(column):
     """Squares of such values would make covariances infinite."""
-    depth = np.arange(10.0, 40.0, 0.1)
-    values = {'amplitude': np.sin(3.0 * depth), 'sigma': np.full(len(depth), 0.1)}
-    values[column] = 1e120 * np.abs(values[column])
-    tracker = FathometerTracker(FathometerConfig(particles=50))
-    assert tracker.process(Trace(stamp_ns=1, depth=depth, **values)) == []
+    depth, traces = np.arange(10.0, 40.0, 0.1), []
+    for k, unit in enumerate((1e120, 1e98)):
+        values = {'amplitude': np.sin(3.0 * depth), 'sigma': np.full(len(depth), 0.1)}
+        values[column] = unit * np.abs(values[column])
+        traces.append(Trace(stamp_ns=k + 1, depth=depth, **values))
+    tracker, found = run(traces, particles=50)
     assert tracker.counts['out_of_range'] == 1
-    values[column] = values[column] * 1e-22
-    (estimate,) = tracker.process(Trace(stamp_ns=2, depth=depth, **values))
+    (estimate,) = found.values()
     seen = np.isfinite(estimate.state[:, 0])
     assert np.isfinite(estimate.covariance[seen]).all()
 
@@ -113,21 +106,29 @@ def test_where_the_window_leaves_nothing_amplitudes_are_not_relative():
     grid = np.arange(0.0, 100.0, 1.0)
     # In a snapshot of 0.1 s sound goes to 75 m and back.
     response = Response(1, 'a', grid, grid, grid, 0.0, aperture=3.0, snapshot_seconds=0.1)
-    relative = relative_amplitude(found, response, config)
+    relative = verbs.relative_amplitude(found, response, config)
     assert relative[0] == pytest.approx((2.0 * 20.0 + 3.0) / (1.0 - 40.0 / 150.0))
     assert np.isnan(relative[1])
+    # Freed of spreading over the height that is true.
+    response = Response(1, 'a', grid, grid, grid, 25.0)
+    for heave, height in ((0.0, 30.0), (0.5, 30.5)):
+        found = evolve(reflectors([55.0], [1.0]), heave=heave, heave_std=0.1)
+        relative = verbs.relative_amplitude(found, response, FathometerConfig())
+        assert relative == pytest.approx([2.0 * height])
 
 
 def test_what_was_lost_does_not_take_over_from_what_is_still_seen():
     """Reflector 6 was lost five records ago, a hand's breadth nearer than 7 was a record ago."""
     config = FathometerConfig(depth_std=0.1)
-    lost, seen = Identified(6, 22.78, 4), Identified(7, 22.92, 0)
-    assert list(nearest_ids(np.array([22.83]), [lost, seen], config)) == [7]
+    lost, seen = (Identified(6, 22.78, 4), Identified(7, 22.92, 0))
+    assert list(verbs.nearest_ids(np.array([22.83]), [lost, seen], config)) == [7]
     # Far more probable where it was than a walk of four standard deviations.
-    assert list(nearest_ids(np.array([22.53]), [Identified(6, 22.54, 4), seen], config)) == [6]
+    assert list(verbs.nearest_ids(np.array([22.53]), [Identified(6, 22.54, 4), seen], config)) == [
+        6
+    ]
     # Of two that were seen equally long ago the nearest, whatever the order.
     for earlier in ([seen, Identified(8, 22.8, 0)], [Identified(8, 22.8, 0), seen]):
-        assert list(nearest_ids(np.array([22.84, 23.0]), earlier, config)) == [8, 7]
+        assert list(verbs.nearest_ids(np.array([22.84, 23.0]), earlier, config)) == [8, 7]
 
 
 def test_a_reflector_is_waited_for_as_many_records_as_is_told():
@@ -155,7 +156,7 @@ def test_members_of_sets_become_metres_and_amplitudes_with_what_is_not_known_of_
     lattice = Lattice(50.0, 0.1, 200)
     sigma = 2.0 + np.arange(200) / 100.0
     response = Response(1, 'array', lattice.depth, np.zeros(200), sigma)
-    found = reflectors_of(members(2), response, lattice, pulse_of(config), config)
+    found = verbs.reflectors_of(members(2), response, lattice, pulse_of(config), config)
     assert found.depth == pytest.approx([52.0, 54.0])
     assert found.amplitude == pytest.approx(5.0 * sigma[[20, 40]])
     for covariance, noise in zip(found.covariance, sigma[[20, 40]]):
@@ -166,21 +167,11 @@ def test_members_of_sets_become_metres_and_amplitudes_with_what_is_not_known_of_
         assert covariance == pytest.approx(np.array(expected), rel=1e-3)
     # Where heave is a state the particles are spread by it, and the noise is that of the place
     # where the echo lies in the record.
-    heaved = reflectors_of(
-        members(2), response, lattice, pulse_of(config), config, heave=(1.0, 0.25)
-    )
+    known = response, lattice, pulse_of(config), config
+    heaved = verbs.reflectors_of(members(2), *known, heave=(1.0, 0.25))
     assert heaved.covariance[:, 0, 0] == pytest.approx(0.1**2 * (0.25 + 1.0 / 12.0))
     assert heaved.amplitude == pytest.approx(5.0 * sigma[[30, 50]])
     assert (heaved.heave, heaved.heave_std) == (1.0, 0.25)
-
-
-def test_amplitudes_are_freed_of_spreading_over_the_height_that_is_true():
-    config = FathometerConfig()
-    grid = np.arange(0.0, 100.0, 1.0)
-    response = Response(1, 'a', grid, grid, grid, 25.0)
-    for heave, height in ((0.0, 30.0), (0.5, 30.5)):
-        found = evolve(reflectors([55.0], [1.0]), heave=heave, heave_std=0.1)
-        assert relative_amplitude(found, response, config) == pytest.approx([2.0 * height])
 
 
 def test_identities_beyond_32_bits_are_those_that_no_reflector_has():
@@ -194,13 +185,8 @@ def test_identities_beyond_32_bits_are_those_that_no_reflector_has():
 def test_pmf_of_what_is_detectable_is_that_of_independent_reflectors():
     """Poisson-binomial, by enumeration of who is there."""
     config = FathometerConfig(order_max=4, detectable_sigmas=4.0)
-    known = Identities(
-        (
-            Identified(1, 10.0, 0, strength=9.0, shown=20),
-            Identified(2, 12.0, 0, strength=-4.1, shown=5),
-            Identified(3, 14.0, 0, strength=2.0, shown=1),
-        )
-    )
+    rows = zip((1, 2, 3), (10.0, 12.0, 14.0), (9.0, -4.1, 2.0), (20, 5, 1))
+    known = Identities(tuple(Identified(k, z, 0, strength=s, shown=n) for k, z, s, n in rows))
     existence = np.array([0.9, 0.8, 0.7])
     pmf = known.detectable(np.array([1, 2, 3], np.uint32), existence, config)
     off = np.array([5.0, 0.1, -2.0]) / np.sqrt(1.0 / np.array([20, 5, 1]) + 0.15**2)
@@ -212,11 +198,9 @@ def test_pmf_of_what_is_detectable_is_that_of_independent_reflectors():
 
 
 def test_strength_is_a_mean_of_the_last_twenty_records():
-    config, known = FathometerConfig(), Identities()
+    known, here = (Identities(), (np.array([10.0]), np.ones(1), FathometerConfig()))
     for strength in [3.0] * 30 + [5.0]:
-        known, ids = known.name(
-            np.array([10.0]), np.ones(1), config, strength=np.array([strength])
-        )
+        known, _ = known.name(*here, strength=np.array([strength]))
     (only,) = known.reflectors
     assert only.shown == 20 and only.strength == pytest.approx(3.0 + 2.0 / 20.0)
 
@@ -256,11 +240,11 @@ def after(depths, config, **options):
     return marked.probabilities(record(depths[-1], **options), config, 40.0)
 
 
-def drawn(rng, records, walk=0.0, std=0.03):
+def drawn(rng, records, walk):
     """Depths (T, 6), ascending, with errors: the primaries, a surface multiple, a peg-leg."""
     z = PRIMARIES + walk * np.cumsum(rng.standard_normal((records, 4)), axis=0)
     surface, leg = z[:, 0] + z[:, 2], 2.0 * z[:, 3] - z[:, 0]
-    found = np.column_stack([z, surface, leg]) + std * rng.standard_normal((records, 6))
+    found = np.column_stack([z, surface, leg]) + 0.03 * rng.standard_normal((records, 6))
     found[:, 4] += 0.03 * rng.standard_normal(records)
     return found
 
@@ -276,7 +260,7 @@ def test_the_ways_are_pairs_and_triples_above():
     assert len(ways_above(sign, 0).sign) == 0
 
 
-@pytest.mark.parametrize('walk, records', [(0.0, 20), (0.05, 20), (0.05, 5)])
+@pytest.mark.parametrize('walk, records', [(0.0, 20), (0.05, 5)])
 def test_drawn_multiples_are_found_and_primaries_are_not(walk, records):
     rng, config = np.random.default_rng(1), FathometerConfig(depth_std=0.05)
     found = np.array([after(drawn(rng, records, walk), config) for _ in range(60)]) > 0.5
@@ -291,48 +275,40 @@ def test_a_primary_that_starts_where_a_multiple_would_be_walks_away():
     assert after(depth, config)[1] > 0.99
     depth[:, 1] += 0.1 * np.cumsum(np.abs(rng.standard_normal(RECORDS)))
     assert after(depth, config)[1] < 0.01
-
-
-def test_one_wrong_record_does_not_decide():
-    config, depth = FathometerConfig(), np.tile([9.0, 18.0], (20, 1))
+    # One wrong record does not decide.
+    depth = np.tile([9.0, 18.0], (20, 1))
     depth[10, 1] += 1.5
-    assert after(depth, config)[1] > 0.9
+    assert after(depth, FathometerConfig())[1] > 0.9
+
+
+def odds(depths, config, **options):
+    """Of the last reflector."""
+    p = after(np.array([depths]), config, **options)[-1]
+    return p / (1.0 - p)
 
 
 def test_all_ways_share_one_prior():
     """More reflectors above are more ways by which one may lie there by chance."""
-    config = FathometerConfig()
-    few, many = np.array([[9.0, 18.05]]), np.array([[5.1, 7.7, 9.0, 18.05]])
-
-    def odds(depth):
-        p = after(depth, config)[-1]
-        return p / (1.0 - p)
-
-    ways = [len(ways_above(np.ones(d.shape[1]), d.shape[1] - 1).sign) for d in (few, many)]
-    assert ways == [1, 10]
-    assert odds(few) / odds(many) == pytest.approx(10.0, rel=0.05)
+    config, few, many = FathometerConfig(), [9.0, 18.05], [5.1, 7.7, 9.0, 18.05]
+    assert [len(ways_above(np.ones(len(z)), len(z) - 1).sign) for z in (few, many)] == [1, 10]
+    assert odds(few, config) / odds(many, config) == pytest.approx(10.0, rel=0.05)
 
 
 def test_of_very_many_ways_the_nearest_count(monkeypatch):
     """Here both reflectors together alone, and not twice either, which ends 0.05 m beside it."""
-    odds = []
-    for most in (multiples.MOST_WAYS, 1):
-        monkeypatch.setattr(multiples, 'MOST_WAYS', most)
-        p = after(np.array([[9.0, 9.05, 18.05]]), FathometerConfig())[-1]
-        odds.append(p / (1.0 - p))
-    assert 2.0 < odds[0] / odds[1] < 3.0
+    depths, config = [9.0, 9.05, 18.05], FathometerConfig()
+    all_ways = odds(depths, config)
+    monkeypatch.setattr(multiples, 'MOST_WAYS', 1)
+    assert 2.0 < all_ways / odds(depths, config) < 3.0
 
 
 def test_the_sign_counts_where_there_are_two():
-    depth = np.tile([9.0, 18.05], (1, 1))
+    depths, right, wrong = [9.0, 18.05], {'sign': [1.0, -1.0]}, {'sign': [1.0, 1.0]}
     both, positive = FathometerConfig(polarity='both'), FathometerConfig()
-    right, wrong = {'sign': [1.0, -1.0]}, {'sign': [1.0, 1.0]}
-    right_odds, wrong_odds = (
-        p / (1.0 - p) for p in (after(depth, both, **kind)[1] for kind in (right, wrong))
-    )
     # Told right .95 times against .05, where .05 and .95 of the primaries have that sign.
-    assert right_odds / wrong_odds == pytest.approx((0.95 / 0.05) ** 2)
-    assert after(depth, positive, **right)[1] == after(depth, positive, **wrong)[1]
+    ratio = odds(depths, both, **right) / odds(depths, both, **wrong)
+    assert ratio == pytest.approx((0.95 / 0.05) ** 2)
+    assert odds(depths, positive, **right) == odds(depths, positive, **wrong)
 
 
 @settings(max_examples=40, deadline=None)
@@ -357,16 +333,10 @@ def test_multiples_of_the_vectors_are_marked_through_the_filter():
     flagged, wrongly = [], []
     for stamp, estimate in found.items():
         if stamp > 10 * 10**9:
-            distance = np.abs(estimate.state[:, :1] - scene.depth_at(stamp))
-            true, near = multiple[distance.argmin(axis=1)], distance.min(axis=1) < 0.3
+            nearest, distance = near_true(estimate, scene.depth_at(stamp))
+            true, near = multiple[nearest], distance < 0.3
             marked = estimate.extras['multiple_probability'] > 0.5
             flagged += list(marked[near & true])
             wrongly += list(marked[near & ~true])
     assert len(flagged) > 80 and len(wrongly) > 140
     assert np.mean(flagged) >= 0.85 and np.mean(wrongly) <= 0.05
-
-
-def test_they_need_not_be_marked():
-    scene = sea_scene('multiples')
-    _, found = run(scene.traces(range(2)), particles=200, multiples='off')
-    assert all(np.isnan(each.extras['multiple_probability']).all() for each in found.values())

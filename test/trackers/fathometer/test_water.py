@@ -6,10 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The floor of profiler lines: labels, depth, the transmit pulse, and envelopes that scatter."""
+"""The floor of profiler lines: labels, depth, the transmit pulse, and envelopes that scatter; and
+real lines as two, of even and odd traces."""
 
 from attrs import evolve
-from helpers.profiler_lines import halves, line, LINES, tracked
 from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
@@ -20,13 +20,55 @@ from sonar_imm.trackers.fathometer.reflectors import Identities
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm.trackers.fathometer.water import SeenFloor, Water
 from sonar_imm_tools.evaluation.fathometer.scoring import records_of
+from sonar_imm_tools.recordings.segy_lines import read_segy
 from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
+
+SECOND, STEP, SAMPLES, PULSE, SETTLED = 10**9, 0.05, 400, 0.15, 10
+LINES = {
+    'flat': {},
+    'silent water': {'noise': 0.002, 'threshold': 0.02},
+    'scatter': {'scatter': 0.3},
+    'transmit pulse': {'ring': 1.5},
+    'waves': {'waves': 2.5},
+}
+
+
+def line(
+    seed, *, records=120, noise=0.02, threshold=0.0, scatter=0.0, ring=0.0, waves=0.0, fixed=0.0
+):
+    """Envelopes of a Gaussian pulse in complex noise, with a floor at about 10 m and two
+    reflectors below it, and the depth of the floor (T,), m. threshold: below which nothing is
+    written; scatter: rms below the floor, falling over 1.5 m; ring: m of transmit pulse; waves:
+    amplitude, m, in 25 records; fixed: amplitude of an echo at 4 m."""
+    rng, depth = np.random.default_rng(seed), STEP * np.arange(SAMPLES)
+    record, traces = np.arange(records), []
+    below = 10.0 + 0.3 * np.sin(record / 19.0) + waves * np.sin(2.0 * np.pi * record / 25.0)
+
+    def echo(place, amplitude):
+        phase = np.exp(2j * np.pi * rng.random())
+        return amplitude * phase * np.exp(-0.5 * np.square((depth - place) / PULSE))
+
+    def noise_of(rms):
+        return rms * rng.standard_normal((SAMPLES, 2)) @ [1.0, 1j] / np.sqrt(2.0)
+
+    for k, z in enumerate(below):
+        field = noise_of(noise) + echo(z, 1.0) + echo(z + 3.0, 0.5) + echo(z + 6.0, 0.25)
+        if scatter:
+            under = np.maximum(depth - z, 0.0)
+            field = field + noise_of(1.0) * scatter * np.exp(-under / 1.5) * (depth > z)
+        if fixed:
+            field = field + echo(4.0, fixed)
+        if ring:
+            field = field + 2.0 * np.exp(-np.maximum(depth - ring, 0.0) / 0.1)
+        heard = np.abs(field)
+        heard[heard < threshold] = 0.0
+        traces.append(Trace(stamp_ns=(k + 1) * SECOND, depth=depth, amplitude=heard))
+    return traces, below
 
 
 def test_an_echo_at_a_fixed_depth_and_a_line_that_begins_below_its_floor_are_said():
-    for fixed, said in (({'fixed': 0.2}, True), ({}, False)):
-        traces, _ = line(4, records=75, waves=1.0, **fixed)
-        warnings = run(traces, particles=50)[0].warnings()
+    for fixed, said in ((0.2, True), (0.0, False)):
+        warnings = run(line(4, records=75, waves=1.0, fixed=fixed)[0], particles=50)[0].warnings()
         assert any('it may belong to the instrument' in each for each in warnings) == said
         assert said or warnings == []
     traces, _ = line(5, records=30, scatter=0.5)
@@ -43,62 +85,74 @@ def run(traces, **options):
     return tracker, [each.columns() for trace in traces for each in tracker.process(trace)]
 
 
-def test_noise_and_scatter_of_the_vectors():
+def test_noise_and_scatter_of_the_vectors(floor):
     """From four pulses below the onset on; nearer ours has the scatter of there."""
-    v = load_vectors('fathometer_in_the_field/floor')
+    v, water = floor, Water(FathometerConfig())
     step, count = float(v['step']), v['trace'].shape[1]
-    water = Water(FathometerConfig())
     depth = step * np.arange(count)
     water.begin(Trace(stamp_ns=1, depth=depth, amplitude=v['trace'][0]))
     water._noise, water._scatter = v['water_profile'], np.zeros(count)
     water._pulse = float(v['pulse']) / step
-    water._lead, expected = (
-        2.4 * water._pulse,
-        dict(zip(v['posterior_records'].tolist(), v['noise_and_scatter'])),
-    )
+    water._lead = 2.4 * water._pulse
+    expected = dict(zip(v['posterior_records'].tolist(), v['noise_and_scatter']))
     for k, (trace, onset) in enumerate(zip(v['trace'], v['onset'].tolist())):
         seen = water._update_scatter(trace, onset)
         if k in expected:
-            begin = onset + int(np.ceil(4.0 * water._pulse))
+            near, begin = (onset + int(np.ceil(n * water._pulse)) for n in (3.4, 4.0))
             assert seen[begin:] == pytest.approx(expected[k][begin:], rel=1e-9)
-            near = onset + int(np.ceil(3.4 * water._pulse))
             assert seen[:near] == pytest.approx(expected[k][:near], rel=1e-9)
             power = seen[near:begin] ** 2 - water._noise[near:begin] ** 2
             assert power == pytest.approx(seen[begin] ** 2 - water._noise[begin] ** 2, abs=1e-12)
             assert k == 0 or seen[begin] > 1.02 * water._noise[begin]
+    # A short trace is no line.
+    short = Water(FathometerConfig())
+    short.begin(Trace(stamp_ns=1, depth=np.arange(10.0), amplitude=np.ones(10)))
+    assert short.active is False
 
 
-def test_labels_of_the_vectors():
-    v = load_vectors('fathometer_in_the_field/floor')
+def test_labels_of_the_vectors(floor):
+    v, known = floor, (0.45, 0.1, 1.0)
     for k, row in enumerate(v['posterior_records']):
-        floor = SeenFloor(
-            v['posterior'][k], 0.0, float(v['step']), float(v['pulse']), 0.45, 0.1, 1.0
-        )
-        bottom, above = floor.labels(v['reflector_depth'])
+        seen = SeenFloor(v['posterior'][k], 0.0, float(v['step']), float(v['pulse']), *known)
+        bottom, above = seen.labels(v['reflector_depth'])
         assert bottom == pytest.approx(v['is_bottom'][row], abs=1e-6)
         assert above == pytest.approx(v['above_bottom'][row], abs=1e-6)
-        depth, std = floor.depth
+        depth, std = seen.depth
         assert abs(depth - v['floor'][row]) < 3.0 * std
 
 
-@pytest.mark.parametrize('kind', ['flat', 'silent water', 'scatter', 'transmit pulse', 'waves'])
+@pytest.fixture(scope='module')
+def floor():
+    return load_vectors('fathometer_in_the_field/floor')
+
+
+@pytest.mark.parametrize('kind', LINES)
 def test_floor_is_the_floor(kind):
-    found = tracked(*line(7, records=60, **LINES[kind]), particles=1000)
-    assert found['ghosts'] < 0.05 and found['label'] > 0.95 and found['inside'] > 0.95
-    assert found['said'] > (0.7 if kind == 'waves' else 0.95)
+    """With nothing told but what converters write: ghosts more than 1 m above it, whether the
+    greatest `is_bottom` is near it, and whether it is within two standard deviations."""
+    traces, floor = line(7, records=60, **LINES[kind])
+    rows = []
+    for z, found in zip(floor[SETTLED:], run(traces, particles=1000)[1][SETTLED:]):
+        depth, label = found['depth'], np.nan_to_num(found['is_bottom'])
+        near, error = np.abs(depth - z) < 0.5, abs(found['bottom_depth'][0] - z)
+        ghosts = np.sum((found['existence'] >= 0.5) & (depth < z - 1.0))
+        inside = error <= 2.0 * found['bottom_depth_std'][0]
+        rows.append([ghosts, near[np.argmax(label)], inside, label[near].max(initial=0.0)])
+    ghosts, right, inside, said = np.mean(rows, axis=0)
+    assert ghosts < 0.05 and right > 0.95 and inside > 0.95
+    assert said > (0.7 if kind == 'waves' else 0.95)
 
 
 def test_nothing_is_said_of_the_floor_before_ten_traces_unless_noise_is_stated():
     traces, floor = line(1, records=12)
     _, rows = run(traces)
-    assert all(np.isnan(each['is_bottom']).all() for each in rows[:9])
-    assert all(np.isnan(each['bottom_depth']).all() for each in rows[:9])
+    for each in rows[:9]:
+        assert np.isnan(each['is_bottom']).all() and np.isnan(each['bottom_depth']).all()
     assert rows[9]['is_bottom'].max() > 0.7
     _, rows = run(traces, noise_sigma=0.02, pulse='gaussian', pulse_width=0.15)
     assert rows[0]['is_bottom'].max() > 0.7 and rows[0]['existence'].min() > 0.5
-    error = [each['bottom_depth'][0] - z for each, z in zip(rows, floor)]
-    std = [each['bottom_depth_std'][0] for each in rows]
-    assert (np.abs(error) < 2.0 * np.array(std)).all()
+    for each, z in zip(rows, floor):
+        assert abs(each['bottom_depth'][0] - z) < 2.0 * each['bottom_depth_std'][0]
 
 
 def test_amplitudes_are_in_the_unit_of_the_trace():
@@ -114,12 +168,17 @@ def test_amplitudes_are_in_the_unit_of_the_trace():
 
 
 def test_the_transmit_pulse_is_left_out_and_said():
-    traces, _ = line(3, records=20, ring=1.5)
+    traces, floor = line(3, records=20, ring=1.5)
     tracker, rows = run(traces)
     assert rows[-1]['blanked'][0] == pytest.approx(1.75, abs=0.3)
     assert min(each['depth'].min() for each in rows[10:]) > 5.0
     sentence = tracker.warnings()[0]
     assert sentence.startswith('the first ') and 'transmit pulse' in sentence
+    # A transmitter far below the surface has one too: depths are those below the surface.
+    deep = [evolve(each, depth=each.depth + 100.0, reference_depth=100.0) for each in traces]
+    lower = run(deep)[1][-1]
+    assert lower['blanked'][0] == pytest.approx(rows[-1]['blanked'][0] + 100.0)
+    assert lower['bottom_depth'][0] == pytest.approx(floor[-1] + 100.0, abs=0.5)
     tracker, rows = run(traces, blanking=3.0)
     assert tracker.warnings() == [] and rows[-1]['blanked'][0] == 0.0
 
@@ -139,9 +198,8 @@ def test_arrays_and_signed_traces_are_as_before():
 def test_missing_samples_and_other_depths_are_taken():
     rng, odd = np.random.default_rng(0), []
     for k, each in enumerate(line(8, records=30)[0]):
-        amplitude = each.amplitude.copy()
+        amplitude, first = each.amplitude.copy(), k % 3
         amplitude[rng.integers(0, len(amplitude), 20)] = np.nan
-        first = k % 3
         odd.append(evolve(each, depth=each.depth[first:], amplitude=amplitude[first:]))
     tracker, rows = run(odd)
     assert tracker.counts['used'] == 30
@@ -151,36 +209,44 @@ def test_missing_samples_and_other_depths_are_taken():
 def test_a_window_that_shifts_is_followed_under_the_same_ids():
     """The recording delay of a line that gets deeper is changed once: 8 m of 12 m are new."""
     traces, floor = line(9, records=60)
-    shifted = []
+    floor, shifted = floor + 0.1 * np.arange(60), []
     for k, each in enumerate(traces):
-        deeper = 0.1 * k
-        first = 6.0 if k < 30 else 9.0
-        depth = np.arange(first, first + 12.0, 0.05)
-        amplitude = np.interp(depth, each.depth + deeper, each.amplitude, right=0.02)
+        depth = np.arange(12.0 / STEP) * STEP + (6.0 if k < 30 else 9.0)
+        amplitude = np.interp(depth, each.depth + 0.1 * k, each.amplitude, right=0.02)
         shifted.append(Trace(stamp_ns=each.stamp_ns, depth=depth, amplitude=amplitude))
     options = {'noise_sigma': 0.02, 'pulse': 'gaussian', 'pulse_width': 0.15, 'particles': 1000}
     tracker, rows = run(shifted, **options)
     assert tracker.counts['used'] == 60 and not tracker.counts['other_depths']
     named = set()
-    for k, row in enumerate(rows):
-        near = np.abs(row['depth'] - floor[k] - 0.1 * k) < 0.5
+    for row, z in zip(rows, floor):
+        near = np.abs(row['depth'] - z) < 0.5
         assert near.any() and row['is_bottom'][near].max() > 0.5
         named |= set(row['track_id'][near].tolist())
     assert len(named) == 1
 
 
-def test_a_short_trace_is_no_line():
-    water = Water(FathometerConfig())
-    water.begin(Trace(stamp_ns=1, depth=np.arange(10.0), amplitude=np.ones(10)))
-    assert water.active is False
-
-
 @pytest.mark.parametrize('path', real_lines() or [None], ids=lambda p: p.stem[-20:] if p else '-')
 def test_halves_of_real_lines_agree(path):
+    """Each half stacked in pairs; floors differ by more than 0.75 m, or by less than two standard
+    deviations."""
     if path is None:
         pytest.skip('no real recordings here; SONAR_IMM_DATA names their folder')
-    found = halves(path, 0.376)
-    assert found['apart'] < 0.06 and found['inside'] > 0.95
+    amplitude, floors = read_segy(path).amplitude, []
+    depth = 0.376 * np.arange(amplitude.shape[1])
+    for half in (amplitude[::2], amplitude[1::2]):
+        water, found = Water(FathometerConfig()), []
+        stacked = half[: len(half) // 2 * 2].reshape(-1, 2, half.shape[1]).mean(axis=1)
+        for k, row in enumerate(stacked):
+            trace = Trace(stamp_ns=k + 1, depth=depth, amplitude=row)
+            if water.active is None:
+                water.begin(trace)
+            found.append(water.take(trace)[2].depth)
+        floors.append(np.array(found))
+    count = min(map(len, floors))
+    (z, std), (other, other_std) = (each[SETTLED:count].T for each in floors)
+    apart = np.abs(z - other)
+    assert np.mean(~(apart <= 0.75)) < 0.06
+    assert np.mean(apart <= 2.0 * np.hypot(std, other_std)) > 0.95
 
 
 def cut_line(first, top=12.0):
@@ -213,28 +279,14 @@ def test_the_tail_of_a_floor_above_the_window_is_said():
     assert not tracker.warnings() and found[-1]['bottom_depth'][0] == pytest.approx(13.5, abs=0.4)
 
 
-def test_a_transmitter_far_below_the_surface_has_a_transmit_pulse():
-    """Depths are those below the surface, the transmitter is at 100 m."""
-    traces, floor = line(7, records=60, **LINES['transmit pulse'])
-    deep = [evolve(each, depth=each.depth + 100.0, reference_depth=100.0) for each in traces]
-    plain, lower = (run(each)[1][-1] for each in (traces, deep))
-    assert lower['blanked'][0] == pytest.approx(plain['blanked'][0] + 100.0)
-    assert plain['blanked'][0] > 0.0
-    assert lower['bottom_depth'][0] == pytest.approx(floor[-1] + 100.0, abs=0.5)
-
-
-SECOND = 10**9
-
-
 @pytest.fixture(scope='module')
 def scene():
     return simulate(scenario('diffuse', {'records': 60}), 5)
 
 
 def stated(**overrides):
-    return FathometerConfig.from_mapping(
-        {**scenario('diffuse').instruments(), 'particles': 1000, **overrides}, ignore_unknown=True
-    )
+    stated = {**scenario('diffuse').instruments(), 'particles': 1000, **overrides}
+    return FathometerConfig.from_mapping(stated, ignore_unknown=True)
 
 
 def track(scene, config):
@@ -257,28 +309,24 @@ def test_the_scene_is_quiet_above_the_floor_and_scatters_below(scene):
 
 def test_the_floor_is_followed_under_one_identity(scene):
     _, estimates = track(scene, stated())
-    rows = [each.columns() for each in estimates]
-    first = [int(np.argmax(each['is_bottom'])) for each in rows]
-    away = [each['depth'][k] - true.depth.min() for each, k, true in zip(rows, first, scene.truth)]
-    assert np.mean(np.abs(away) < 1.0) >= 0.95
-    assert len({int(each['track_id'][k]) for each, k in zip(rows, first)}) == 1
+    away, names = [], set()
+    for each, true in zip((each.columns() for each in estimates), scene.truth):
+        k = int(np.argmax(each['is_bottom']))
+        away.append(each['depth'][k] - true.depth.min())
+        names.add(int(each['track_id'][k]))
+    assert np.mean(np.abs(away) < 1.0) >= 0.95 and len(names) == 1
     right = [len(r.found) == len(t.depth) for r, t in zip(records_of(estimates), scene.truth)]
     assert np.mean(right) >= 0.9
 
 
 def test_a_faint_floor_is_not_lost_to_what_scatters_below_it(scene):
     """A soft floor, a third of the loudest, 5 m above where the scatter begins."""
-    faint = []
-    for each, true in zip(scene.measurements[:25], scene.truth):
-        trace = each.measurement
-        floor = true.depth.min() - 5.0
-        width = stated().pulse_width
-        echo = 0.35 * trace.amplitude.max()
-        echo *= np.exp(-0.5 * np.square((trace.depth - floor) / width))
-        faint.append((evolve(trace, amplitude=trace.amplitude + echo), floor))
     tracker, right = FathometerTracker(stated()), []
-    for trace, floor in faint:
-        columns = tracker.process(trace)[0].columns()
+    for each, true in zip(scene.measurements[:25], scene.truth):
+        trace, floor = each.measurement, true.depth.min() - 5.0
+        echo = np.exp(-0.5 * np.square((trace.depth - floor) / stated().pulse_width))
+        amplitude = trace.amplitude + 0.35 * trace.amplitude.max() * echo
+        columns = tracker.process(evolve(trace, amplitude=amplitude))[0].columns()
         right.append(abs(columns['depth'][np.argmax(columns['is_bottom'])] - floor) < 0.5)
     assert np.mean(right) >= 0.9
 
@@ -302,26 +350,20 @@ def test_the_first_return_keeps_its_name_on_a_wall():
     assert list(ids) == [3, 1, 2]
 
 
-def test_a_wrong_pulse_is_said_with_its_remedy(scene):
-    tracker, _ = track(
-        scene, FathometerConfig(noise_sigma=0.02, particles=300, water='off', pulse='band')
-    )
-    sentences = ' '.join(tracker.warnings())
-    assert 'envelopes need water auto' in sentences and 'no set of reflectors' in sentences
-    tracker, _ = track(scene, stated(particles=300))
-    assert tracker.warnings() == []
-
-
-def test_a_full_set_is_said(scene):
-    tracker, _ = track(scene, stated(order_max=2, particles=300))
-    sentences = ' '.join(tracker.warnings())
-    assert 'against a limit of 2' in sentences and 'order_max may not fit' in sentences
+def test_a_wrong_pulse_and_a_full_set_are_said_with_their_remedy(scene):
+    wrong = FathometerConfig(noise_sigma=0.02, particles=300, water='off', pulse='band')
+    for config, *said in (
+        (wrong, 'envelopes need water auto', 'no set of reflectors'),
+        (stated(order_max=2, particles=300), 'against a limit of 2', 'order_max may not fit'),
+    ):
+        sentences = ' '.join(track(scene, config)[0].warnings())
+        assert all(each in sentences for each in said)
+    assert track(scene, stated(particles=300))[0].warnings() == []
 
 
 def test_unexplained_records_are_said():
-    tracker = FathometerTracker(
-        FathometerConfig(pulse='gaussian', noise_sigma=0.1, order_min=6, order_max=6, particles=50)
-    )
+    impossible = {'order_min': 6, 'order_max': 6, 'pulse': 'gaussian', 'noise_sigma': 0.1}
+    tracker = FathometerTracker(FathometerConfig(particles=50, **impossible))
     depth = 0.25 * np.arange(80)
     for second in range(1, 13):
         amplitude = -np.exp(-0.5 * np.square(depth - 10.0))
