@@ -7,7 +7,8 @@
 # language governing permissions and limitations under the License.
 
 """The harness of the studies: options from parameters, tables as they come, one file; studies in
-their smallest size, whose numbers the pages find; what of reliability falls short is said; and minutes of a day at sea, offline."""
+their smallest size, whose numbers the pages find; what of reliability falls short is said; and
+minutes of a day at sea, offline."""
 
 from collections.abc import Sequence
 from datetime import date
