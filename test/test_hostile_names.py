@@ -30,7 +30,7 @@ from sonar_imm.texts import in_one_line, visible
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.cli.common import warn
 from sonar_imm_tools.evaluation.plotting import plain_content
-from sonar_imm_tools.recordings.csv_writer import CsvWriter, in_cell
+from sonar_imm_tools.recordings.export import CsvWriter, in_cell
 from sonar_imm_tools.recordings.export.horizons import Picks, write_horizons
 from sonar_imm_tools.recordings.export.tracks import tracks_of, write_tracks
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message

@@ -69,7 +69,7 @@ def loaded_alone(threads_of):
 
 INSTALLED = """
 import sys
-sys.argv[0] = '/opt/lib/sonar_imm/{}_node'
+sys.argv[0] = '/opt/lib/sonar_imm/obstacle_node'
 from sonar_imm.nodes.commands import main
 main()
 """
@@ -98,17 +98,14 @@ def test_the_library_leaves_the_process_alone(threads_of, loaded_alone):
     assert threads_of('-c', late) == loaded_alone
 
 
-@pytest.mark.parametrize(
-    'start', [('-m', 'sonar_imm.nodes.diver'), ('-c', INSTALLED.format('obstacle'))]
-)
-def test_a_node_has_one_thread_of_algebra(threads_of, loaded_alone, start):
+def test_a_node_has_one_thread_of_algebra(threads_of, loaded_alone):
     """Its parameters are refused, so it ends by itself; the middleware has threads of its own, and
     so has the BLAS of scipy."""
     pytest.importorskip('rclpy')
-    arguments = ('--ros-args', '-p', 'history:=-1.0')
-    alone = threads_of(*start, *arguments, OPENBLAS_NUM_THREADS='1')
-    assert threads_of(*start, *arguments) == alone
-    assert threads_of(*start, *arguments, OPENBLAS_NUM_THREADS='2') > alone
+    words = ('-c', INSTALLED, '--ros-args', '-p', 'history:=-1.0')
+    alone = threads_of(*words, OPENBLAS_NUM_THREADS='1')
+    assert threads_of(*words) == alone
+    assert threads_of(*words, OPENBLAS_NUM_THREADS='2') > alone
 
 
 def test_every_node_has_its_command():

@@ -205,7 +205,7 @@ def _user_error(error: Exception) -> str | None:
     from ..recordings.sources import BagError, NoRecordingError
 
     if isinstance(error, NoRecordingError):
-        from ..recordings.sniffing import hint
+        from ..recordings.convert import hint
 
         return f'{error}{hint(error.path)}'
     if isinstance(error, (ConfigError, Rejection, BagError)):

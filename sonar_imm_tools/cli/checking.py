@@ -27,9 +27,9 @@ from ..evaluation.judging import Check, Judgement
 from ..offline.batch import Job
 from ..offline.run_folder import BAG, CSV, RunFolder
 from ..offline.tracking import final_estimates, InputOptions
+from ..recordings.measurements import instruments
 from ..recordings.own_files import LIMIT, own_limit, own_parameters, own_recipe
 from ..recordings.reader import BagReader
-from ..recordings.topics import instruments
 from ..replay.harness import LockstepResult, run_lockstep
 from ..resources import share_folder
 from .common import load_config, load_detector, node_file, progress

@@ -21,8 +21,7 @@ import click
 from sonar_imm.gone import GONE
 from sonar_imm.trackers import SYSTEMS
 
-from ..recordings.convert_options import DETECTING, FROM_BAGS, OPTIONS
-from ..recordings.options import Group, Option, spec_of
+from ..recordings.convert_options import DETECTING, FROM_BAGS, Group, Option, OPTIONS, spec_of
 from . import options as opt
 from .common import by_topic, load_detector, print_json, progress, say, typed_overrides, warn
 from .info import track_line
@@ -43,7 +42,7 @@ class Convert(click.Group):
         if gone := GONE.get(f'kind {args[0]}'):
             ctx.fail(f"'{args[0]}' {gone}")
         if source.exists():
-            from ..recordings.sniffing import sniff
+            from ..recordings.convert import sniff
 
             guess = sniff(source, _named_columns(args))
             warn(f'{source} is taken for {guess.why}: convert {guess.kind}')
@@ -281,8 +280,8 @@ def _described(report: ConversionReport) -> dict[str, Any]:
 
 def _print(report: ConversionReport) -> None:
     from ..evaluation.numbers import counted
+    from ..recordings.measurements import ready_systems
     from ..recordings.reader import BagReader
-    from ..recordings.topics import ready_systems
 
     say(f'{report.path}: {by_topic(report.messages)}, from {report.rows} rows')
     for key, value in report.notes.items():

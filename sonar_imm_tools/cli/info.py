@@ -34,9 +34,9 @@ def command(bag: Path, strict: bool, as_json: bool) -> None:
     no tracker can use it.
     """
     from ..offline.inspection import inspect
+    from ..recordings.measurements import system_in_mind, types_heard
     from ..recordings.own_files import own_parameters
     from ..recordings.reader import BagReader
-    from ..recordings.topics import system_in_mind, types_heard
 
     # What the parameter file beside a recording says of its images.
     detector = load_detector(SYSTEMS['obstacle'], own_parameters(bag), {})

@@ -190,8 +190,8 @@ class Plan:
         and `ConfigError`."""
         from ..offline.batch import Job
         from ..offline.tracking import InputOptions
+        from ..recordings.measurements import instruments, remarks_on_topics
         from ..recordings.reader import BagReader
-        from ..recordings.topics import instruments, remarks_on_topics
 
         # Input by topic name; None to choose by name.
         wanted = {topic: name for name, topic in self.topics.items()} or None
@@ -319,7 +319,12 @@ def choose_system(
 ) -> System:
     """The tracker called `name`, or else the one that fits an open recording best. Raises
     `BagError` when none does."""
-    from ..recordings.topics import fitting_systems, instruments, knows_inputs, system_in_mind
+    from ..recordings.measurements import (
+        fitting_systems,
+        instruments,
+        knows_inputs,
+        system_in_mind,
+    )
 
     if name is not None:
         return SYSTEMS[name]

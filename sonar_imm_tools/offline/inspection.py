@@ -25,8 +25,7 @@ from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.polling import BEFORE, turn_of
 
 from .. import SECOND
-from ..recordings.reader import BagMessage, BagReader, TopicInfo
-from ..recordings.topics import (
+from ..recordings.measurements import (
     every_input,
     fed,
     fitting_systems,
@@ -34,6 +33,7 @@ from ..recordings.topics import (
     is_truth,
     needed_inputs,
 )
+from ..recordings.reader import BagMessage, BagReader, TopicInfo
 
 MOST_FIXES = 1000
 """Fixes of a topic by which it is told whether each has a stamp of its own."""

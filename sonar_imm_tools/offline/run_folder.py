@@ -61,7 +61,7 @@ from sonar_imm.measurements import Rejection
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers import SYSTEMS
 
-from ..recordings.csv_writer import CsvWriter, ROWS_IN_A_BLOCK
+from ..recordings.export import CsvWriter, ROWS_IN_A_BLOCK
 from ..recordings.export.points import read_parquet
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader

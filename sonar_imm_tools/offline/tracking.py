@@ -37,10 +37,9 @@ from sonar_imm.parameters import Config
 from sonar_imm.trackers import System
 
 from .. import SECOND
-from ..recordings.measurements import measurements_of, Received
+from ..recordings.measurements import fitting_topics, measurements_of, Received
 from ..recordings.reader import BagError, BagReader
 from ..recordings.sources import TARGET_NAMES
-from ..recordings.topics import fitting_topics
 from .initial import Initial, target_numbers
 from .jobs import processes
 from .run_folder import AS_CSV, fingerprint, finite, RUN, run_record, RunFolder

@@ -117,9 +117,8 @@ USUAL_NAMES = {
         'fix_quality position_quality quality_flag qualitaet qualite calidad qualidade kvalitet'
     ),
     'tag': (
-        'tag_id transmitter transmitter_id tx tx_id full_id tagname tag_name '
-        'acoustic_tag_id signal sender sender_id sendernummer emetteur transmisor transmissor '
-        'marca marque merke'
+        'tag_id transmitter transmitter_id tx tx_id full_id tagname tag_name acoustic_tag_id '
+        'signal sender sender_id sendernummer emetteur transmisor transmissor marca marque merke'
     ),
     'code_space': 'codespace transmitter_codespace tag_code_space',
     'ping': 'ping_id ping_number',

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 import functools
 import json
 import math
+from operator import itemgetter
 from pathlib import Path
 import re
 from typing import Any, TypeVar
@@ -81,9 +82,10 @@ class ConversionReport:
             self.reasons[reason.replace('_', ' ')] += 1
         kind = reason or re.sub(r"'.*'|[-\d.]+", '', str(why))
         self.kinds[kind] += 1
-        self.examples.setdefault(kind, f'{path.name}, {where}: {why}')
+        sentence = f'{path.name}, {where}: {why}'
+        self.examples.setdefault(kind, sentence)
         if self.bad_rows <= MOST_NAMED:
-            self.problems.append(f'{path.name}, {where}: {why}')
+            self.problems.append(sentence)
         elif self.bad_rows == MOST_NAMED + 1:
             self.problems.append('further bad rows are counted but not listed')
 
@@ -94,11 +96,6 @@ class ConversionReport:
             yield
         except (BadRow, Rejection) as error:
             self.bad_row(path, where, error)
-
-    def note_ignored(self, path: Path, arrays: Sequence[str]) -> None:
-        """Note which arrays of an archive were not used."""
-        if arrays:
-            self.notes[f'ignored arrays of {path.name}'] = ', '.join(arrays)
 
     def nothing(self, what: object) -> BagError:
         """The error of a file without a usable record, with its commonest problem."""
@@ -127,8 +124,8 @@ class ConversionReport:
         for name, form in (table.forms | table.orders).items():
             if form not in ('', 'YMD'):
                 self.notes[f'{name} of {table.path.name}'] = f'{table.header(name)} is {form}'
-        for name, sign, way in (('z', 1.0, 'up'), ('depth', -1.0, 'down')):
-            header, other = table.header(name), {'z': 'depth', 'depth': 'z'}[name]
+        for name, other, sign, way in (('z', 'depth', 1.0, 'up'), ('depth', 'z', -1.0, 'down')):
+            header = table.header(name)
             values = table.first_numbers(table.index[name], sign) if table.has(name) else []
             sounds = name == 'depth' or re.search('depth|tiefe|down', header.lower())
             if sounds and values and max(values) > 0.0 and (name == 'z' or min(values) >= 0.0):
@@ -145,21 +142,19 @@ class ConversionReport:
 def flags_of(prefix: str, report: ConversionReport) -> Iterator[None]:
     """Name the options of a table beside the input, as in ``--truth-column``, in every sentence
     about that table."""
-    flag = f'--{prefix}-'
+    name_flags = functools.partial(_OF_TABLES.sub, f'--{prefix}-')
     problems, examples = len(report.problems), set(report.examples)
     try:
         yield
     except BagError as error:
-        sentence = _OF_TABLES.sub(flag, error.sentence)
+        sentence = name_flags(error.sentence)
         if sentence == error.sentence:
             raise
         raise BagError(sentence) from None
     finally:
-        report.problems[problems:] = [
-            _OF_TABLES.sub(flag, problem) for problem in report.problems[problems:]
-        ]
+        report.problems[problems:] = map(name_flags, report.problems[problems:])
         for kind in report.examples.keys() - examples:
-            report.examples[kind] = _OF_TABLES.sub(flag, report.examples[kind])
+            report.examples[kind] = name_flags(report.examples[kind])
 
 
 def converter(options: type[Any]) -> Callable[[Converter], Callable[..., ConversionReport]]:
@@ -274,27 +269,31 @@ def write_bag(
     packed = [
         (stamp, topic, message.__msgtype__, cdr_of(message)) for stamp, topic, message in records
     ]
-    if streams is None:
-        topics = dict.fromkeys(topic for _, topic, *_ in packed if 'truth/' not in topic)
-        streams = {
-            each: [stamp for stamp, topic, *_ in packed if topic == each] for each in topics
-        }
-    off = _wrong_stamps(streams, source, report)
-    kept = (record for record in packed if record[0] not in off)
-    ordered = sorted(kept, key=lambda record: record[0])
+    own: dict[str, list[int]] = {}
+    for stamp, topic, *_ in packed:
+        if 'truth/' not in topic:
+            own.setdefault(topic, []).append(stamp)
+    off = _wrong_stamps(own if streams is None else streams, source, report)
+    ordered = sorted((each for each in packed if each[0] not in off), key=itemgetter(0))
     if not ordered or (needed and all(topic != needed for _, topic, *_ in ordered)):
         raise report.nothing(source)
-    notes = provenance(source, report.notes)
-    if named := {str(number): name for name, number in report.target_names.items()}:
-        notes[TARGET_NAMES] = json.dumps(named, ensure_ascii=False)
-    with BagWriter(
-        report.path, storage=how.storage, custom_data=notes, parameters=parameters
-    ) as bag:
+    with new_bag(report, source, how, parameters) as bag:
         for stamp_ns, topic, kind, raw in ordered:
             bag.write_raw(topic, kind, raw, stamp_ns)
-            report.messages[topic] += 1
 
 
-def provenance(source: str, notes: Mapping[str, str]) -> dict[str, str]:
-    """What a converted bag notes beside its messages."""
-    return {'source': source, 'converted_by': 'sonar-imm convert', **notes}
+@contextmanager
+def new_bag(
+    report: ConversionReport,
+    source: str,
+    how: Any,
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+) -> Iterator[BagWriter]:
+    """Open the bag of a report, which has its notes and counts its messages, for writing."""
+    notes = {'source': source, 'converted_by': 'sonar-imm convert', **report.notes}
+    if named := {str(number): name for name, number in report.target_names.items()}:
+        notes[TARGET_NAMES] = json.dumps(named, ensure_ascii=False)
+    place, storage = report.path, how.storage
+    with BagWriter(place, storage=storage, custom_data=notes, parameters=parameters) as bag:
+        report.messages = bag.counts
+        yield bag

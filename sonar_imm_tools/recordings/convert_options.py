@@ -6,20 +6,100 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The options of each kind of conversion: one attrs class for each, with the help page of
-``sonar-imm convert KIND``."""
+"""The options of each kind of conversion, declared once for the converter and for the help page
+of ``sonar-imm convert KIND``, as long as that is.
+
+A converter is told its options as an attrs class. Every field is made with `option`, which keeps
+what the command line needs beside the default, or is a group of options of its own, such as those
+of a CSV file, made with `group`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, ClassVar
 
-from attrs import frozen, NOTHING
+import attrs
+from attrs import evolve, field, frozen, NOTHING
 
-from .options import group, option
-from .places import BEARINGS, RANGES
-from .tables import CsvOptions
+from sonar_imm.parameters import did_you_mean, Range
+
+from .columns import ALIASES
+from .sources import BagError
+from .times import DAYS, GPS, HHMMSS, ORDERS, zone_of
+
+BEARINGS = ('bow', 'north', 'east')
+"""Where bearings count from: clockwise from the bow or from north, counter-clockwise from east."""
+TIME_UNITS = {
+    's': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1,
+    'min': 60 * 10**9, 'h': 3600 * 10**9, 'd': 86400 * 10**9,
+}  # fmt: skip
+_UNITS = (*TIME_UNITS, HHMMSS, *DAYS, GPS)
+_KEY = 'sonar_imm.option'
+KINDS = {'float': 'float', 'int': 'int', 'Path': 'file', 'Mapping': 'pairs'}
+"""Kinds of options by the types of their fields; ``text`` for others."""
+
+
+@frozen(kw_only=True)
+class Option:
+    """An option of the command line.
+
+    metavar: what the help page shows for its value; empty for the name of the type. flag: its
+    spelling where that is not the name of the field. kind: ``text``, ``float``, ``int``, ``file``,
+    ``speed`` for that of sound, a number or a file with a profile, or ``pairs`` for NAME=VALUE,
+    which may be repeated; by default as `KINDS` has it for the type of the field. range: of a
+    number, inclusive; above: a limit it has to exceed. parse: from the text to the value; raises
+    ValueError with a sentence. many: may be repeated.
+    """
+
+    help: str
+    metavar: str = ''
+    flag: str = ''
+    kind: str = ''
+    range: Range = (None, None)
+    above: float | None = None
+    choices: tuple[str, ...] = ()
+    parse: Callable[[str], Any] | None = None
+    many: bool = False
+
+
+@frozen
+class Group:
+    """Options of an attrs class as a field of another one: their flags begin with `prefix`, and
+    `what` takes the place of ``{what}`` in their help texts."""
+
+    options: type
+    prefix: str
+    what: str
+
+
+def option(default: Any, metavar: str, help: str, **more: Any) -> Any:
+    """A field that is one option; `more` is as in `Option`. With the default attrs.NOTHING it has
+    to be given."""
+    default = attrs.Factory(dict) if default == {} else default
+    spec = Option(help=help, metavar=metavar, **more)
+    return field(default=default, metadata={_KEY: spec})
+
+
+def group(options: type, prefix: str = '', what: str = 'the input') -> Any:
+    return field(factory=options, metadata={_KEY: Group(options, prefix, what)})
+
+
+def spec_of(attribute: attrs.Attribute[Any]) -> Option | Group:
+    """What was declared of a field."""
+    found: Option | Group = attribute.metadata[_KEY]
+    if isinstance(found, Group) or found.kind:
+        return found
+    return evolve(found, kind=KINDS.get(str(attribute.type).split()[0].split('[')[0], 'text'))
+
+
+def _nanoseconds(text: str) -> int:
+    try:
+        return int(Decimal(text) * 10**9)
+    except (InvalidOperation, ValueError, OverflowError):
+        raise ValueError(f"'{text}' is not a number of seconds") from None
 
 
 def _origin(text: str) -> tuple[float, ...]:
@@ -48,6 +128,48 @@ def _staves(text: str) -> list[list[int]]:
 
 # fmt: off
 @frozen(kw_only=True)
+class CsvOptions:
+    """How to read a CSV file.
+
+    columns: what is not listed is found by its usual names (`ALIASES`); case and units are
+    ignored. time_zone, empty: UTC where the header says so (``utc_time``), else times without a
+    zone are refused. time_unit, empty: from the header (``time_ms``), else s; ISO 8601 texts are
+    recognised, also as a date and a time of day in two columns.
+    """
+
+    columns: Mapping[str, str] = option({}, 'NAME=HEADER',
+        'Header of a column of {what}, e.g. x=easting.', flag='column')
+    time_zone: str = option('', 'ZONE',
+        'Zone of times in {what} that do not say it: UTC, +02:00 or Europe/Berlin.')
+    time_unit: str = option('', 'UNIT',
+        'Unit of numeric times in {what}: s, ms, us, ns, min, h or d; HHMMSS for a time of day '
+        'in one number; days of MATLAB (datenum), a spreadsheet (excel), or the Julian calendar '
+        '(julian, mjd); seconds of GPS time (gps).', choices=('', *_UNITS))
+    date_order: str = option('', 'ORDER',
+        'Order of day, month and year in dates such as 05/06/24 in {what}.', choices=('', *ORDERS))
+    time_offset_ns: int = option(0, 'SECONDS',
+        'Added to every time of {what}.', flag='time-offset', kind='text', parse=_nanoseconds)
+    delimiter: str = option('', '',
+        'Delimiter between the columns of {what}; found automatically by default.')
+    ignore: Sequence[str] = option((), 'NAME',
+        'Quantity of {what} to leave out though a column has its name, e.g. id.', many=True)
+
+    def __attrs_post_init__(self) -> None:
+        if self.time_unit not in ('', *_UNITS):
+            raise BagError(
+                f"the time unit must be one of {', '.join(_UNITS)}, got '{self.time_unit}'"
+            )
+        if self.time_zone:
+            zone_of(self.time_zone)
+        for name in (*self.columns, *self.ignore):
+            if name not in ALIASES:
+                raise BagError(
+                    f"there is no quantity '{name}' to map a column to"
+                    f'{did_you_mean(name, ALIASES)}'
+                )
+
+
+@frozen(kw_only=True)
 class _Options:
     storage: str = option('mcap', '', 'Storage of the bag.', choices=('mcap', 'sqlite3'))
 
@@ -61,8 +183,7 @@ class _Places(_Options):
 
 @frozen(kw_only=True)
 class _WithTruth(_Places):
-    truth: Path | str | None = option(None, '',
-        'CSV of true positions for the same bag.', kind='file')
+    truth: Path | str | None = option(None, '', 'CSV of true positions for the same bag.')
     truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
 
 
@@ -70,7 +191,7 @@ class _WithTruth(_Places):
 class _Navigated(_Options):
     nav: Path | str | None = option(None, '',
         'CSV of where the instrument was: stamp, x and y [m] or latitude and longitude [deg], '
-        'heading [deg, clockwise from north], z or depth, roll, pitch [deg].', kind='file')
+        'heading [deg, clockwise from north], z or depth, roll, pitch [deg].')
     nav_options: CsvOptions = group(CsvOptions, 'nav', 'the navigation')
 
 
@@ -82,8 +203,7 @@ class _OfSonar(_Options):
 @frozen(kw_only=True)
 class _Detecting(_OfSonar):
     parameters: Mapping[str, Any] = option({}, 'NAME=VALUE',
-        'Change one parameter of the detector; may be given several times.', flag='set',
-        kind='pairs')
+        'Change one parameter of the detector; may be given several times.', flag='set')
 
 
 def _bearings(usual: str) -> Any:
@@ -111,18 +231,18 @@ def _phase_scale() -> Any:
 class _Polar(_WithTruth):
     options: CsvOptions = group(CsvOptions)
     range_std: float | None = option(None, 'METRES',
-        'Standard deviation of ranges, for rows that state none.', kind='float', above=0.0)
+        'Standard deviation of ranges, for rows that state none.', above=0.0)
     bearing_std_deg: float | None = option(None, 'DEGREES',
-        'Standard deviation of bearings, for rows that state none.', flag='bearing-std',
-        kind='float', above=0.0)
+        'Standard deviation of bearings, for rows that state none.', flag='bearing-std', above=0.0)
     ranges: str = option('', '',
         'Whether ranges are along the ray (slant) or in the plane (horizontal). By default as '
-        'their header says, else horizontal where the depth hardly matters.', choices=RANGES)
+        'their header says, else horizontal where the depth hardly matters.',
+        choices=('', 'slant', 'horizontal'))
 
 
 @frozen(kw_only=True)
 class _Receivers(_WithTruth):
-    receivers: Path | str = option(NOTHING, '', 'CSV of receiver positions.', kind='file')
+    receivers: Path | str = option(NOTHING, '', 'CSV of receiver positions.')
     options: CsvOptions = group(CsvOptions)
     receiver_options: CsvOptions = group(CsvOptions, 'receiver', 'the position files')
 
@@ -147,7 +267,7 @@ class FixesOptions(_Polar):
     )
     bearings: str | None = _bearings('north')
     depth_std: float | None = option(None, 'METRES',
-        'Standard deviation of z or depth, for rows that state none.', kind='float', above=0.0)
+        'Standard deviation of z or depth, for rows that state none.', above=0.0)
 
 
 @frozen(kw_only=True)
@@ -198,10 +318,9 @@ class ArrivalsOptions(_Receivers):
     """
 
     EXAMPLES: ClassVar = ('arrivals.csv dive.bag --receivers hydrophones.csv',)
-    transmitters: Path | str | None = option(None, '',
-        'CSV of transmitter positions.', kind='file')
+    transmitters: Path | str | None = option(None, '', 'CSV of transmitter positions.')
     toa_std: float | None = option(None, 'SECONDS',
-        'Standard deviation of arrival times, for rows that state none.', kind='float', above=0.0)
+        'Standard deviation of arrival times, for rows that state none.', above=0.0)
 
 
 @frozen(kw_only=True)
@@ -219,19 +338,18 @@ class DetectionsOptions(_Receivers):
         'detections.csv fish.bag --receivers stations.csv --toa-std 0.001',
     )
     sync: Path | str | None = option(None, '',
-        'CSV of the positions of fixed tags, with the column tag.', kind='file')
+        'CSV of the positions of fixed tags, with the column tag.')
     window: float | None = option(None, 'SECONDS',
         'Longest time between the first and the last detection of a ping; by default 1, or half '
-        'of the time between the pings of a tag.', kind='float', range=(1e-3, 600.0))
+        'of the time between the pings of a tag.', range=(1e-3, 600.0))
     clock_interval: float = option(12.0, 'HOURS',
-        'Time over which the clock of a receiver drifts evenly.', kind='float',
-        range=(0.1, 1e4))
+        'Time over which the clock of a receiver drifts evenly.', range=(0.1, 1e4))
     sound_speed: float = option(1500.0, '',
         'Speed of sound in m/s, or a file with its profile, for the travel times from fixed tags.',
         kind='speed', range=(1300.0, 1700.0))
     toa_std: float | None = option(None, 'SECONDS',
         'Standard deviation of arrival times; by default that of the clocks after --sync.',
-        kind='float', above=0.0)
+        above=0.0)
 
 
 @frozen(kw_only=True)
@@ -257,11 +375,11 @@ class SnapshotsOptions(_Navigated):
         'pings.npz survey.bag --name iq=data', 'ping.npz ping.bag --staves 0+3,1+2',
     )
     names: Mapping[str, str] = option({}, 'WHAT=ARRAY',
-        'Name of an array in this archive, e.g. iq=data.', flag='name', kind='pairs')
+        'Name of an array in this archive, e.g. iq=data.', flag='name')
     staves: Sequence[Sequence[int]] | None = option(None, 'CHANNELS',
         'Channels, from 0, of each stave; those joined by + are summed.', parse=_staves)
     ping_rate: float = option(10.0, '',
-        'Pings per second, when there are no stamps.', kind='float', range=(0.001, 1000.0))
+        'Pings per second, when there are no stamps.', range=(0.001, 1000.0))
     frame_id: str = option('sonar', '', 'Frame of the sonar.')
 
 
@@ -278,7 +396,7 @@ class ImagesOptions(_Options):
     EXAMPLES: ClassVar = ('survey.bag detections.bag --set image_order=beam_major',)
     topic: str | None = option(None, '', 'Topic of the images, where several could be.')
     parameters: Mapping[str, Any] = option({}, 'NAME=VALUE',
-        'Change one parameter; may be given several times.', flag='set', kind='pairs')
+        'Change one parameter; may be given several times.', flag='set')
 
 
 @frozen(kw_only=True)
@@ -302,8 +420,7 @@ class InterferometerOptions(_Options):
         'Topic with the complex samples of a stave, the uppermost first; once for each.',
         many=True)
     fields: Mapping[str, str] = option({}, 'WHAT=PATH',
-        'Where something stands in the messages, e.g. phase=sidescan.phase.', flag='field',
-        kind='pairs')
+        'Where something stands in the messages, e.g. phase=sidescan.phase.', flag='field')
     side: str = option('', '', 'Of the array.', choices=('port', 'starboard'))
     radians_per_count: float | None = _phase_scale()
     element_spacing: float | None = _element_spacing()
@@ -334,11 +451,10 @@ class HydrophonesOptions(_Navigated):
         'Channels of the hydrophones, from 0, the deepest first; all in their order by default.',
         parse=_whole_numbers)
     full_scale: float = option(1.0, 'PASCALS',
-        'Pressure of the full scale. The tracker needs ratios only.', kind='float', above=0.0)
+        'Pressure of the full scale. The tracker needs ratios only.', above=0.0)
     depth: float | None = option(None, 'METRES',
-        'Depth of the deepest hydrophone, to be stated with each block.', kind='float')
-    block: float = option(1.0, 'SECONDS',
-        'Length of a message.', kind='float', range=(0.01, 600.0))
+        'Depth of the deepest hydrophone, to be stated with each block.')
+    block: float = option(1.0, 'SECONDS', 'Length of a message.', range=(0.01, 600.0))
     frame_id: str = option('array', '', 'Frame of the array.')
 
 
@@ -358,25 +474,20 @@ class SegyOptions(_Navigated):
     start: str = option('', 'TIME',
         'Time of the first trace, e.g. 2024-05-31T10:00:00Z, where the headers hold no date.')
     rate: float = option(1.0, '',
-        'Traces per second, where the headers hold no times.', kind='float', range=(1e-6, 1e6))
+        'Traces per second, where the headers hold no times.', range=(1e-6, 1e6))
     crs: int | None = option(None, 'EPSG',
-        'Coordinate system of places in metres or feet. Needs rasterio.', kind='int',
-        range=(1, None))
+        'Coordinate system of places in metres or feet. Needs rasterio.', range=(1, None))
     sample_spacing: float | None = option(None, 'METRES',
-        'Depth from sample to sample; by default from the sample interval.', kind='float',
-        above=0.0)
+        'Depth from sample to sample; by default from the sample interval.', above=0.0)
     sound_speed: float = option(1500.0, '',
         'Speed of sound in m/s, or a file with its profile, for the sample interval and the '
-        'recording delay.',
-        kind='speed', range=(1300.0, 1700.0))
+        'recording delay.', kind='speed', range=(1300.0, 1700.0))
     first_sample: int = option(0, '',
-        'Leave out samples before it, e.g. the transmit pulse.', kind='int', range=(0, None))
+        'Leave out samples before it, e.g. the transmit pulse.', range=(0, None))
     samples: int | None = option(None, '',
-        'How many samples to take; all by default.', kind='int', range=(2, None))
-    stack: int = option(1, '',
-        'Number of successive traces averaged into one.', kind='int', range=(1, None))
-    depth_offset: float = option(0.0, 'METRES',
-        'Depth of the transducer.', flag='depth', kind='float')
+        'How many samples to take; all by default.', range=(2, None))
+    stack: int = option(1, '', 'Number of successive traces averaged into one.', range=(1, None))
+    depth_offset: float = option(0.0, 'METRES', 'Depth of the transducer.', flag='depth')
     frame_id: str = option('profiler', '', 'Frame of the traces.')
 
 
@@ -394,7 +505,7 @@ class TracesOptions(_Navigated):
     )
     options: CsvOptions = group(CsvOptions)
     rate: float = option(1.0, '',
-        'Traces per second, when an archive has no stamps.', kind='float', range=(1e-6, 1e6))
+        'Traces per second, when an archive has no stamps.', range=(1e-6, 1e6))
     frame_id: str = option('array', '', 'Frame of the traces.')
 
 @frozen(kw_only=True)
@@ -408,13 +519,12 @@ class XtfOptions(_Detecting):
     """
 
     EXAMPLES: ClassVar = ('line.xtf line.bag', 'line.xtf line.bag --side port')
-    side: str = option('starboard', '', 'Side whose echoes are found.',
-        choices=('starboard', 'port'))
-    units: str = option('auto', '', 'Units of the places; auto: what the file says.',
-        choices=('auto', 'degrees', 'metres'))
+    side: str = option('starboard', '',
+        'Side whose echoes are found.', choices=('starboard', 'port'))
+    units: str = option('auto', '',
+        'Units of the places; auto: what the file says.', choices=('auto', 'degrees', 'metres'))
     frequency: float | None = option(None, 'HZ',
-        'Which channel of a side, of several frequencies; by default the first one.',
-        kind='float', above=0.0)
+        'Which channel of a side, of several frequencies; by default the first one.', above=0.0)
     port_samples: str = option('far', '',
         'Which sample of a port channel comes first: most programs write the farthest.',
         choices=('far', 'near'))
@@ -434,13 +544,13 @@ class PicturesOptions(_Detecting):
     """
 
     EXAMPLES: ClassVar = ('frames dive.bag --far-range 40 --fov 90',)
-    table: Path | str | None = option(None, '', 'The CSV, where there are several.', kind='file')
+    table: Path | str | None = option(None, '', 'The CSV, where there are several.')
     near_range: float = option(0.0, 'METRES',
-        'Range of the first row, for rows that state none.', kind='float', range=(0.0, 1e4))
+        'Range of the first row, for rows that state none.', range=(0.0, 1e4))
     far_range: float | None = option(None, 'METRES',
-        'Range of the last row, for rows that state none.', kind='float', range=(0.1, 1e4))
+        'Range of the last row, for rows that state none.', range=(0.1, 1e4))
     fov: float | None = option(None, 'DEGREES',
-        'Width of the sector, for rows that state none.', kind='float', range=(0.1, 360.0))
+        'Width of the sector, for rows that state none.', range=(0.1, 360.0))
     options: CsvOptions = group(CsvOptions)
 # fmt: on
 

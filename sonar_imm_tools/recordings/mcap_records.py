@@ -9,17 +9,16 @@
 """The records of an MCAP file, their checksums, and reading it without its index.
 
 A file is a sequence of records, each with a one-byte operation code and a length. Messages lie in
-chunks, which may be compressed. There is room for three kinds of CRC-32, and a zero means that
-there is none: of what each chunk unpacks to, of everything before the record that ends the data,
-and of the summary with the index. rosbags writes none and checks those of chunks only. With all
-three no bit of the file can turn without being noticed.
+chunks, which may be compressed. There is room for three kinds of CRC-32, zero for none: of what
+each chunk unpacks to, of everything before the record that ends the data, and of the summary with
+the index. rosbags writes none and checks those of chunks only. With all three no bit of the file
+can turn without being noticed.
 
-The index that readers rely on is written last. Without it (a crashed recorder, a full disk, a
-broken copy) the records can still be read from the front up to the first damaged one, whole ones
-inside a cut-off chunk too: a recorder fills a chunk for minutes, so with small messages the last
-chunk can be most of the recording. Where the index is sound it says where the chunks lie, so that
-a damaged one costs no more than itself. Only the position of each message is kept in memory, about
-30 bytes for each.
+The index is written last. Without it (a crashed recorder, a full disk, a broken copy) the records
+are read from the front up to the first damaged one, whole ones inside a cut-off chunk too, which
+can be most of a recording. Where the index is sound it says where the chunks lie, so that a
+damaged one costs no more than itself. Only the position of each message is kept in memory, about
+30 bytes for each. Writing and reading of checksums need the same walk, and so stand in one place.
 
 Source: the MCAP format, https://mcap.dev/spec (Chunk, Data End, Footer).
 """
@@ -46,7 +45,7 @@ else:
 
 MAGIC = b'\x89MCAP0\r\n'
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX = 0x02, 0x03, 0x04, 0x05, 0x06, 0x08
-STATISTICS, SUMMARY_OFFSET, DATA_END = 0x0B, 0x0E, 0x0F
+STATISTICS, DATA_END = 0x0B, 0x0F
 RECORD = struct.Struct('<BQ')
 _CHUNK_HEAD = struct.Struct('<QQQI')
 _FOOTER = struct.Struct('<BQQQI')
@@ -65,12 +64,12 @@ class TooLargeError(ValueError):
 
 class ChunkHead(NamedTuple):
     """What a chunk says of itself: bytes that it unpacks to, their CRC-32 or 0, how it is
-    compressed, and where in the chunk the packed bytes start."""
+    compressed, and the packed bytes."""
 
     size: int
     checksum: int
     compression: str
-    start: int
+    packed: bytes
 
 
 class Footer(NamedTuple):
@@ -108,7 +107,7 @@ def chunk_head(content: bytes) -> ChunkHead:
     """Read the head of a chunk. Raises struct.error or UnicodeDecodeError where there is none."""
     _, _, size, checksum = _CHUNK_HEAD.unpack_from(content)
     compression, at = text(content, _CHUNK_HEAD.size)
-    return ChunkHead(size, checksum, compression, at + 8)
+    return ChunkHead(size, checksum, compression, content[at + 8 :])
 
 
 def text(content: bytes, at: int) -> tuple[str, int]:
@@ -172,14 +171,13 @@ def _unpacks_to_too_much(chunk: bytes) -> bool:
     """Whether a chunk is too large. Other damage is left to the reader."""
     try:
         head = chunk_head(chunk)
-        packed = chunk[head.start :]
         framed: int | None = head.size
         if head.compression == 'zstd':
-            framed = zstd.get_frame_info(packed).decompressed_size
+            framed = zstd.get_frame_info(head.packed).decompressed_size
         elif head.compression == 'lz4':
-            framed = lz4.frame.get_frame_info(packed)['content_size'] or None
+            framed = lz4.frame.get_frame_info(head.packed)['content_size'] or None
         if framed is None:
-            framed = len(unpack(packed, head.compression))
+            framed = len(unpack(head.packed, head.compression))
     except TooLargeError:
         return True
     except (struct.error, UnicodeDecodeError, RuntimeError, zstd.ZstdError):
@@ -204,9 +202,8 @@ def seal(path: Path) -> None:
         for position, code, length in list(records(file, len(MAGIC), size)):
             if code == CHUNK:
                 file.seek(position + RECORD.size)
-                content = file.read(length)
-                head = chunk_head(content)
-                _put(file, position + _CHUNK_SUM, crc32(unpack(content[head.start :], head[2])))
+                head = chunk_head(file.read(length))
+                _put(file, position + _CHUNK_SUM, crc32(unpack(head.packed, head.compression)))
         end = footer.summary - _DATA_END.size
         _put(file, footer.summary - _SUM.size, _crc(file, 0, end))
         last = size - len(MAGIC) - _SUM.size
@@ -221,11 +218,8 @@ def wrong_sums(path: Path) -> list[str]:
         footer = footer_of(file, size)
         if footer is None:
             return []
-        wrong = {
-            'data': not _data_is_right(file, footer.summary),
-            'index': not summary_is_right(file, size, footer),
-        }
-        return [part for part, is_wrong in wrong.items() if is_wrong]
+        data = [] if _data_is_right(file, footer.summary) else ['data']
+        return data if summary_is_right(file, size, footer) else [*data, 'index']
 
 
 def summary_is_right(file: BinaryIO, size: int, footer: Footer) -> bool:
@@ -241,9 +235,8 @@ def _data_is_right(file: BinaryIO, summary: int) -> bool:
         return True
     file.seek(end)
     code, length, stated = _DATA_END.unpack(file.read(_DATA_END.size))
-    if (code, length) != (DATA_END, _SUM.size):
-        return False
-    return not stated or stated == _crc(file, 0, end)
+    is_end = (code, length) == (DATA_END, _SUM.size)
+    return is_end and (not stated or stated == _crc(file, 0, end))
 
 
 def _put(file: BinaryIO, position: int, total: int) -> None:
@@ -290,17 +283,14 @@ class McapScan:
         self._lost: dict[str, None] = {}
         self._lengths: dict[int, int] = {}
         self._schemas: dict[int, tuple[str, str, str]] = {}
-        self._log, self._channel = array('Q'), array('H')
-        self._block, self._start, self._length = array('q'), array('Q'), array('Q')
+        # Log time, channel, block, start and length of each message.
+        self._messages: tuple[array[int], ...] = tuple(array(code) for code in 'QHqQQ')
         self._chunk = lru_cache(maxsize=2)(self._read_chunk)
         try:
             if self._file.read(len(MAGIC)) != MAGIC:
                 raise ValueError('it does not start like an MCAP file')
             self._read_summary()
-            if self._lengths:
-                self._walk_chunks()
-            else:
-                self._walk_file()
+            self._walk_chunks() if self._lengths else self._walk_file()
         except BaseException:
             self._file.close()
             raise
@@ -312,20 +302,17 @@ class McapScan:
 
     def messages(self, channels: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
         """Yield (channel, log time in ns, data) by log time; equal times keep the file's order."""
-        log = np.frombuffer(self._log, np.uint64) if self._log else np.empty(0, np.uint64)
-        for i in np.argsort(log, kind='stable'):
-            if self._channel[i] not in channels:
+        for i in np.argsort(np.array(self._messages[0]), kind='stable'):
+            log_ns, channel, block, start, length = (column[i] for column in self._messages)
+            if channel not in channels:
                 continue
-            start, length = self._start[i], self._length[i]
-            if self._block[i] == _UNCHUNKED:
+            if block == _UNCHUNKED:
                 self._file.seek(start)
-                data = self._file.read(length)
+                yield channel, log_ns, self._file.read(length)
             else:
-                data = self._chunk(self._block[i])[start : start + length]
-            yield self._channel[i], self._log[i], data
+                yield channel, log_ns, self._chunk(block)[start : start + length]
 
     def close(self) -> None:
-        """Close the file."""
         self._chunk.cache_clear()
         self._file.close()
 
@@ -346,7 +333,6 @@ class McapScan:
                 (self.stated,) = struct.unpack_from('<Q', content)
 
     def _walk_chunks(self) -> None:
-        """Walk the chunks of the index."""
         for position, length in sorted(self._lengths.items()):
             self._file.seek(position)
             if self._file.read(RECORD.size) != RECORD.pack(CHUNK, length):
@@ -400,7 +386,7 @@ class McapScan:
         packed = self._file.read(min(length, self._size))
         try:
             head = chunk_head(packed)
-            content = unpack(packed[head.start :], head.compression)
+            content = unpack(head.packed, head.compression)
         except TooLargeError:
             self._lose(f'has a chunk at byte {position} that {TOO_LARGE}')
             return b''
@@ -413,16 +399,14 @@ class McapScan:
         return content
 
     def _take(self, code: int, content: bytes, block: int, start: int) -> None:
-        """Note one schema, channel or message."""
         try:
             if code == MESSAGE:
                 channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(content)
                 if channel in self.channels:
-                    self._log.append(log_ns)
-                    self._channel.append(channel)
-                    self._block.append(block)
-                    self._start.append(start + _MESSAGE_HEAD.size)
-                    self._length.append(len(content) - _MESSAGE_HEAD.size)
+                    begin, length = start + _MESSAGE_HEAD.size, len(content) - _MESSAGE_HEAD.size
+                    row = (log_ns, channel, block, begin, length)
+                    for column, value in zip(self._messages, row):
+                        column.append(value)
                     self.counts[channel] += 1
                 return
             (number,) = struct.unpack_from('<H', content)

@@ -19,16 +19,11 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
-_BITS = (8, 16, 32, 64)
-_DTYPES = {
-    **dict.fromkeys(('octet', 'byte', 'char'), np.dtype(np.uint8)),
-    **{name: np.dtype(name) for name in ('bool', 'float32', 'float64')},
-    **{f'{kind}{bits}': np.dtype(f'{kind}{bits}') for kind in ('int', 'uint') for bits in _BITS},
-}
-_SCALARS = {
-    name: bool if name == 'bool' else float if name.startswith('float') else int
-    for name in _DTYPES
-}
+_NUMBERS = 'bool float32 float64 int8 int16 int32 int64 uint8 uint16 uint32 uint64'.split()
+_DTYPES = {name: np.dtype(name) for name in _NUMBERS}
+_DTYPES |= dict.fromkeys(('octet', 'byte', 'char'), np.dtype(np.uint8))
+_SCALARS: dict[str, type] = {'string': str, 'wstring': str}
+_SCALARS |= {name: {'b': bool, 'f': float}.get(each.kind, int) for name, each in _DTYPES.items()}
 
 
 @cache
@@ -47,12 +42,11 @@ def ros_message(type_name: str, /, **fields: Any) -> Any:
     message_class, kinds = _layout(type_name)
     if unknown := fields.keys() - kinds.keys():
         raise TypeError(f'{type_name} has no field {", ".join(sorted(unknown))}')
-    return message_class(
-        *(
-            _cast(kind, fields[name]) if name in fields else _default(kind)
-            for name, kind in kinds.items()
-        )
+    values = (
+        _cast(kind, fields[name]) if name in fields else _default(kind)
+        for name, kind in kinds.items()
     )
+    return message_class(*values)
 
 
 @cache
@@ -86,8 +80,7 @@ def _cast(kind: Any, value: Any) -> Any:
     """Give `value` exactly the Python type that rosbags wants for a field."""
     node, detail = kind
     if node == Nodetype.BASE:
-        name = detail[0]
-        return str(value) if name in ('string', 'wstring') else _SCALARS[name](value)
+        return _SCALARS[detail[0]](value)
     if node in (Nodetype.ARRAY, Nodetype.SEQUENCE) and _is_numeric(detail[0]):
         dtype = _DTYPES[detail[0][1][0]]
         if isinstance(value, (bytes, bytearray, memoryview)):
@@ -97,12 +90,11 @@ def _cast(kind: Any, value: Any) -> Any:
 
 
 def _default(kind: Any) -> Any:
-    """Give the zero or empty value of a field."""
     node, detail = kind
     if node == Nodetype.NAME:
         return ros_message(detail)
     if node == Nodetype.BASE:
-        return '' if detail[0] in ('string', 'wstring') else _SCALARS[detail[0]]()
+        return _SCALARS[detail[0]]()
     element, length = detail
     if _is_numeric(element):
         return np.zeros(length if node == Nodetype.ARRAY else 0, _DTYPES[element[1][0]])

@@ -8,18 +8,14 @@
 
 """Files that a recording may have beside it: parameters of its instruments, and a limit of error.
 
-Most recordings fit the defaults of a tracker. Where the sonar is mounted elsewhere, or the array
-is another one, the tracker needs these parameters: without them its estimates are wrong or
-missing.
-
-A recording may come from anybody. Its parameters are data: `taken` gives those that describe what
-is tracked and how it was measured, and a file that they name has to lie beside the recording.
-Where a node keeps files, or what it listens to, only its user says.
+Where the sonar is mounted elsewhere, or the array is another one, a tracker needs the parameters.
+A recording may come from anybody, so they are data: `taken` gives those that describe what is
+tracked and how it was measured, and a file that they name has to lie beside the recording. Where a
+node keeps files, or what it listens to, only its user says.
 
 The limit is the largest error that `check` allows, with the arguments of `simulate` that make the
-recording again where an installation left it out. A simulated recording is one draw of many: what
-its error may be follows from the errors of the same scene under other seeds, and not from the
-system.
+recording again where an installation left it out. It follows from the errors of the same scene
+under other seeds.
 """
 
 from __future__ import annotations
@@ -77,13 +73,12 @@ class OwnParameters:
             raise ConfigError(f'{self.path}: {error}') from None
         found, sentences = {}, []
         for name, value in stated.items():
-            if name in known and name not in allowed:
-                sentences.append(
-                    f"{self.path}: '{name}' is not used: it is a parameter of the node, which a "
-                    'recording does not set; give it with --params or --set'
-                )
-                continue
             try:
+                if name in known and name not in allowed:
+                    raise ConfigError(
+                        'it is a parameter of the node, which a recording does not set; give it '
+                        'with --params or --set'
+                    )
                 found[name] = self._placed(value) if name.endswith('_file') else value
             except ConfigError as error:
                 sentences.append(f"{self.path}: '{name}' is not used: {error}")
@@ -130,10 +125,9 @@ def unusual(known: Mapping[str, Any], tracker: type[Config]) -> dict[str, Any]:
 def write_own_parameters(bag: Path, nodes: Mapping[str, Mapping[str, Any]]) -> Path | None:
     """Write parameters by the names of their nodes as a ROS 2 parameter file into the folder of a
     recording; without any nothing is written."""
-    if not any(nodes.values()):
-        return None
-    path = bag / PARAMETERS
-    write_ros_parameters(path, nodes, _HEADS[PARAMETERS])
+    path = bag / PARAMETERS if any(nodes.values()) else None
+    if path is not None:
+        write_ros_parameters(path, nodes, _HEADS[PARAMETERS])
     return path
 
 
@@ -142,15 +136,11 @@ def write_ros_parameters(
 ) -> None:
     """Write parameters by the names of their nodes as a ROS 2 parameter file, after the comment
     `head`; nodes without any are left out."""
-    tree = {
-        name: {
-            'ros__parameters': {
-                key: list(v) if isinstance(v, tuple) else v for key, v in values.items()
-            }
-        }
-        for name, values in nodes.items()
-        if values
-    }
+    tree = {}
+    for name, values in nodes.items():
+        if values:
+            plain = {key: list(v) if isinstance(v, tuple) else v for key, v in values.items()}
+            tree[name] = {'ros__parameters': plain}
     with whole(path) as unfinished:
         unfinished.write_text(head + yaml.safe_dump(tree, sort_keys=False), encoding='utf-8')
 
@@ -194,9 +184,7 @@ def _stated(path: Path) -> dict[str, Any]:
 
 def write_own_limit(bag: Path, limit: float, recipe: Sequence[str] = ()) -> None:
     """Write the limit, and how the recording is made again, into the folder of a recording."""
-    stated: dict[str, Any] = {'limit': limit}
-    if recipe:
-        stated['simulate'] = shlex.join(recipe)
+    stated = {'limit': limit, **({'simulate': shlex.join(recipe)} if recipe else {})}
     with whole(bag / LIMIT) as unfinished:
         text = _HEADS[LIMIT] + yaml.safe_dump(stated, width=1000)
         unfinished.write_text(text, encoding='utf-8')

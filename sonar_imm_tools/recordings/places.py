@@ -6,7 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Positions of CSV rows in local metres: from latitude and longitude, or by range and bearing."""
+"""Positions of CSV rows in local metres: from latitude and longitude, or by range and bearing.
+
+Which of these a table holds, in which units, is asked of the same cells: so all are in one place.
+"""
 
 from __future__ import annotations
 
@@ -58,6 +61,7 @@ LEAST_ROWS, SLOWEST = 5, 2e-4
 """Rows by which units are judged; a speed in degrees a second, of 22 m/s, which in metres no
 measured position has."""
 _AXES = ('latitude', 'longitude')
+_UNKNOWN = (91.0, 181.0, 999.0, 9999.0)
 
 
 class Degrees:
@@ -83,10 +87,8 @@ class Degrees:
             )
         values = {axis: self._first_values(table, axis) for axis in _AXES}
         self._stated = {
-            axis: None
-            if (values[axis] < 0.0).any()
-            else sign_in(axis, table.header(self._names[axis]))
-            for axis in _AXES
+            axis: None if (found < 0.0).any() else sign_in(axis, table.header(self._names[axis]))
+            for axis, found in values.items()
         }
         latitude, longitude = (np.abs(values[axis]) for axis in _AXES)
         self._ask_for_radians(table, latitude, longitude)
@@ -156,14 +158,13 @@ class Degrees:
             parts = [float((part or '0').replace(',', '.')) for part in numbers]
             value = parts[0] + parts[1] / 60.0 + parts[2] / 3600.0
             if max(parts[1:]) >= 60.0:
-                raise BadRow(f"{row.table.header(name)} is '{row.text(name)[:40]}'")
+                raise row.bad(name, '')
             value = -value if minus == '-' else value
             words = [word for word in (before, behind) if word]
         for part, sixtieth in (('minutes', 60.0), ('seconds', 3600.0)):
             own = row.optional(f'{name}_{part}') if row.table.has(f'{name}_{part}') else 0.0
             if not 0.0 <= own < 60.0:
-                header = row.table.header(f'{name}_{part}')
-                raise BadRow(f"{header} is '{row.text(f'{name}_{part}')[:40]}', not 0 to 60")
+                raise row.bad(f'{name}_{part}', ', not 0 to 60')
             value += math.copysign(own / sixtieth, -1.0 if text.startswith('-') else 1.0)
         if self.packed and (found is None or numbers[1] is None):
             whole = math.floor(abs(value) / 100.0)
@@ -177,10 +178,7 @@ class Degrees:
             value = stated * value
         for sign in signs:
             if sign is None or len(signs) > 1 or value < 0.0 < sign:
-                raise BadRow(
-                    f"{row.table.header(name)} is '{row.text(name)[:40]}' with the hemisphere "
-                    f"'{words[-1][:20]}'"
-                )
+                raise row.bad(name, f" with the hemisphere '{words[-1][:20]}'")
             value = sign * abs(value)
         return value
 
@@ -203,9 +201,8 @@ class Degrees:
             if found and all(word in letters or sign_of(axis, word) for word in found)
         ]
         beside = [k for k in (at + 1, at - 1) if k in fitting]
-        if words.get(table.index.get(name, -1)) and all(
-            NUMBER.match(word) for word in words[table.index[name]]
-        ):
+        named = words.get(table.index.get(name, -1))
+        if named and all(map(NUMBER.match, named)):
             del table.index[name]  # an offset to the north or east
         if name not in table.index:
             if not beside and len(fitting) != 1:
@@ -230,9 +227,6 @@ class Degrees:
         return factor * np.array([value for value in values if abs(value) not in _UNKNOWN])
 
 
-_UNKNOWN = (91.0, 181.0, 999.0, 9999.0)
-
-
 class LocalFrame:
     """The local frame of the positions of a table.
 
@@ -242,13 +236,15 @@ class LocalFrame:
     """
 
     def __init__(self, table: Table, origin: tuple[float, ...] | None = None):
-        metres = table.has('x', 'y')
-        if metres and table.has('latitude', 'longitude') and _are_hemispheres(table):
+        degrees = table.has('latitude', 'longitude')
+        if degrees and table.has('x', 'y') and _are_hemispheres(table):
             del table.index['x'], table.index['y']
-            metres = False
-        self.geodetic = table.has('latitude', 'longitude') and (
-            not metres or table.is_blank('x', 'y')
-        )
+        metres = table.has('x', 'y')
+        self.geodetic = degrees and (not metres or table.is_blank('x', 'y'))
+        self.origin = checked_origin(origin) if self.geodetic else None
+        self._degrees = Degrees(table) if self.geodetic else None
+        if self._degrees is not None and self.origin is not None:
+            self._degrees.check_origin(table, self.origin)
         if not self.geodetic:
             if not any(table.has(name) for name in ('x', 'y')):
                 for found, other in (('latitude', 'longitude'), ('longitude', 'latitude')):
@@ -260,23 +256,28 @@ class LocalFrame:
                     '--column x=HEADER'
                 )
             table.require('x', 'y')
-        if metres and table.has('latitude', 'longitude') and not self.geodetic:
-            _ask_for_places(table)
-        if not self.geodetic:
+            if degrees:
+                _ask_for_places(table)
             _ask_for_degrees(table)
-        self.origin = checked_origin(origin) if self.geodetic else None
-        self._degrees = Degrees(table) if self.geodetic else None
-        if self._degrees is not None and self.origin is not None:
-            self._degrees.check_origin(table, self.origin)
 
     def position(self, row: Row) -> tuple[float, float, float]:
         """Give x, y, z of a row in metres. Raises `BadRow`."""
-        if self._degrees is not None:
-            return self._from_geodetic(*self._degrees.place(row), row)
-        x, y, z = row.number('x'), row.number('y'), row.height()
-        if max(abs(x), abs(y), abs(z)) > FARTHEST:
-            raise BadRow(f'the position {x:g}, {y:g}, {z:g} is more than 100,000 km away')
-        return x, y, z
+        if self._degrees is None:
+            x, y, z = row.number('x'), row.number('y'), row.height()
+            if max(abs(x), abs(y), abs(z)) > FARTHEST:
+                raise BadRow(f'the position {x:g}, {y:g}, {z:g} is more than 100,000 km away')
+            return x, y, z
+        latitude, longitude = self._degrees.place(row)
+        beside = any(
+            name in row.table.index and row.table.first_cells(row.table.index[name])
+            for name in ('z', 'depth')
+        )  # an altitude beside a depth is that over the ground
+        of_sea = row.table.has('height') and not beside
+        height = row.optional('height') if of_sea else row.height()
+        height = 0.0 if math.isnan(height) else height
+        self.origin = self.origin or (latitude, longitude, 0.0)
+        east, north, up = Origin(*self.origin).local(latitude, longitude, height).tolist()
+        return east, north, up
 
     def notes(self) -> dict[str, str]:
         """The origin, which is needed to convert back to latitude and longitude."""
@@ -286,21 +287,6 @@ class LocalFrame:
         if self._degrees is not None and self._degrees.packed:
             notes['degrees'] = 'degrees and minutes in one number (DDMM.MM)'
         return notes
-
-    def _from_geodetic(
-        self, latitude: float, longitude: float, row: Row
-    ) -> tuple[float, float, float]:
-        beside = any(
-            name in row.table.index and row.table.first_cells(row.table.index[name])
-            for name in ('z', 'depth')
-        )  # an altitude beside a depth is that over the ground
-        of_sea = row.table.has('height') and not beside
-        height = row.optional('height') if of_sea else row.height()
-        height = 0.0 if math.isnan(height) else height
-        if self.origin is None:
-            self.origin = (latitude, longitude, 0.0)
-        east, north, up = Origin(*self.origin).local(latitude, longitude, height).tolist()
-        return east, north, up
 
 
 def _are_hemispheres(table: Table) -> bool:
@@ -378,9 +364,6 @@ def checked_origin(origin: tuple[float, ...] | None) -> tuple[float, float, floa
     return latitude, longitude, height
 
 
-BEARINGS = ('bow', 'north', 'east')
-"""Where bearings count from: clockwise from the bow or from north, counter-clockwise from east."""
-RANGES = ('', 'slant', 'horizontal')
 TURN = 6.3
 """Radians; beyond it angles can only be degrees."""
 _LEAST, _SHARE = 1.0, 0.05
@@ -390,10 +373,8 @@ _LEAST, _SHARE = 1.0, 0.05
 def bearings_from(table: Table, stated: str | None, usual: str) -> str:
     """Where bearings of a table count from: as stated, else as usual. Raises `BagError` where the
     header has a word for the other one of north and bow."""
-    words = set(plain(table.header('bearing')).split('_'))
-    others = {'north': FROM_BOW, 'bow': FROM_NORTH}[usual]
-    if stated is None and words & others:
-        other = {'north': 'bow', 'bow': 'north'}[usual]
+    other, words = {'north': ('bow', FROM_BOW), 'bow': ('north', FROM_NORTH)}[usual]
+    if stated is None and words & set(plain(table.header('bearing')).split('_')):
         raise BagError(
             f'{table.path}: {table.header("bearing")} may count from {other} or from {usual}; say '
             f'--bearings {other} or --bearings {usual}'
@@ -422,9 +403,9 @@ class PolarRows:
             if table.has(name) and (range_std, bearing_std_deg) == (None, None):
                 table.require(other)
         self._table, self._counted_from = table, counted_from
-        stated = bool(unit_of(table.with_unit('bearing')))
-        self._unit = 1.0 if stated else math.radians(1.0)
-        self._std_unit = table.factor('bearing') if stated else self._unit
+        self._unit = self._std_unit = math.radians(1.0)
+        if unit_of(table.with_unit('bearing')):
+            self._unit, self._std_unit = 1.0, table.factor('bearing')
         if unit_of(table.with_unit('std_bearing')):
             self._std_unit = 1.0
         self._range_std = math.nan if range_std is None else range_std

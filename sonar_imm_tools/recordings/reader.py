@@ -13,9 +13,9 @@
         for message in bag.messages(['/fix']): ...
         for sentence in bag.problems: ...
 
-Messages come in recorded order: by log time, equal times in the order of the file. Live lock-step
-replay and offline tracking both use this order, so data that are late in one are late in the
-other. ``order='stamp'`` sorts by header stamp instead, and holds the whole selection in memory.
+Messages come in recorded order: by log time, equal times in the order of the file, in live
+lock-step replay as offline. ``order='stamp'`` sorts by header stamp instead, and holds the whole
+selection in memory.
 """
 
 from __future__ import annotations
@@ -105,7 +105,6 @@ class BagReader:
         self.close()
 
     def close(self) -> None:
-        """Close the files."""
         while self._sources:
             self._sources.pop().close()
 
@@ -148,9 +147,7 @@ class BagReader:
 
     def cdr(self, item: BagMessage) -> bytes:
         """The decoded message `item` as ROS 2 sends it; ROS 1 bags hold another serialization."""
-        if self.is_ros1:
-            return cdr_of(item.message)
-        return bytes(item.raw)
+        return cdr_of(item.message) if self.is_ros1 else bytes(item.raw)
 
     def messages(
         self,
@@ -215,10 +212,8 @@ class BagReader:
                 stated[topic.name] += topic.count
         for name, count in stated.items():
             if given[name] != count:
-                self.add_problem(
-                    f'topic {name} holds {given[name]} messages; the index of {self.path} says '
-                    f'{count}'
-                )
+                index = f'the index of {self.path} says {count}'
+                self.add_problem(f'topic {name} holds {given[name]} messages; {index}')
 
     def _cannot_decode(self, item: RawMessage, index: int, error: Exception) -> None:
         reason = f'message {index}, {one_line(error)}'
@@ -233,17 +228,11 @@ def _merged(sources: list[Source]) -> list[TopicInfo]:
     joined: dict[tuple[str, str], TopicInfo] = {}
     for source in sources:
         for topic in source.topics():
-            key = (topic.name, topic.type_name)
-            known = joined.get(key)
-            joined[key] = (
-                topic
-                if known is None
-                else evolve(
-                    known,
-                    count=known.count + topic.count,
-                    decodable=known.decodable and topic.decodable,
-                )
-            )
+            known = joined.setdefault((topic.name, topic.type_name), topic)
+            if known is not topic:
+                count, decodable = known.count + topic.count, known.decodable and topic.decodable
+                both = evolve(known, count=count, decodable=decodable)
+                joined[topic.name, topic.type_name] = both
     return [joined[key] for key in sorted(joined)]
 
 

@@ -124,14 +124,11 @@ def read_segy(
     :raises BagError: the file cannot be read, or something that it leaves open is not stated.
     :raises ModuleNotFoundError: segyio is not installed.
     """
-    import segyio
-
     problems: list[str] = []
     questions: list[str] = []
-    fields = segyio.TraceField
     try:
         with _opened(Path(path), problems) as (file, header):
-            depth = file.attributes(fields.SourceWaterDepth)[:]
+            depth, scalar = _words(file, 'SourceWaterDepth', 'ElevationScalar')
             clock = _Clock(Path(path), time_zone, start, rate)
             return SegyLine(
                 clock.stamps(file, questions),
@@ -139,7 +136,7 @@ def read_segy(
                 _intervals(file, header, questions),
                 _delays(file, problems),
                 *_places(file, header, crs, problems),
-                np.maximum(_scaled(depth, file.attributes(fields.ElevationScalar)[:]), 0.0),
+                np.maximum(_scaled(depth, scalar), 0.0),
                 problems,
                 questions,
             )
@@ -231,12 +228,17 @@ def _order_of_su(path: Path, header: bytes) -> str:
     raise BagError(f'{path} cannot be read: it is damaged or no SU file')
 
 
-def _intervals(file: segyio.SegyFile, header: bytes, questions: list[str]) -> FloatArray:
-    """Return the sample interval (T,) of each trace, s, else that of the file."""
+def _words(file: segyio.SegyFile, *names: str) -> list[NDArray]:
+    """Return words of the trace headers, (T,) each, by the names that segyio gives them."""
     import segyio
 
+    return [file.attributes(getattr(segyio.TraceField, name))[:] for name in names]
+
+
+def _intervals(file: segyio.SegyFile, header: bytes, questions: list[str]) -> FloatArray:
+    """Return the sample interval (T,) of each trace, s, else that of the file."""
     # The fields are unsigned, which segyio does not know.
-    own = file.attributes(segyio.TraceField.TRACE_SAMPLE_INTERVAL)[:].astype(np.int64) & 0xFFFF
+    own = _words(file, 'TRACE_SAMPLE_INTERVAL')[0].astype(np.int64) & 0xFFFF
     whole = float(int.from_bytes(header[16:18], 'big'))
     exact = np.frombuffer(header[72:80], '>f8') if len(header) >= 80 else np.zeros(1)
     # The revision is two words of one byte, of which the greater is the major one.
@@ -253,12 +255,10 @@ def _intervals(file: segyio.SegyFile, header: bytes, questions: list[str]) -> Fl
 
 def _delays(file: segyio.SegyFile, problems: list[str]) -> FloatArray:
     """Return the recording delay (T,), s, from milliseconds with the scalar of times."""
-    import segyio
-
-    scalar = file.attributes(segyio.TraceField.ScalarTraceHeader)[:]
+    delay, scalar = _words(file, 'DelayRecordingTime', 'ScalarTraceHeader')
     if odd := sorted(set(scalar.tolist()) - {0, *SCALARS, *(-each for each in SCALARS)}):
         problems.append(f'{odd[0]} is no scalar of times; the recording delay is taken without it')
-    delay = file.attributes(segyio.TraceField.DelayRecordingTime)[:]
+
     return np.asarray(1e-3 * _scaled(delay, scalar))
 
 
@@ -273,16 +273,12 @@ def _places(
     file: segyio.SegyFile, header: bytes, crs: int | None, problems: list[str]
 ) -> tuple[FloatArray, FloatArray]:
     """Return longitude and latitude (T,), degrees; NaN where unknown."""
-    import segyio
-
-    fields = segyio.TraceField
-    units = file.attributes(fields.CoordinateUnits)[:]
-    scalar = file.attributes(fields.SourceGroupScalar)[:]
+    units, scalar = _words(file, 'CoordinateUnits', 'SourceGroupScalar')
     x, y = (np.zeros(len(units)) for _ in 'xy')
     for names in PLACES:
-        own = [_scaled(file.attributes(getattr(fields, name))[:], scalar) for name in names]
+        east, north = (_scaled(word, scalar) for word in _words(file, *names))
         none = (x == 0.0) & (y == 0.0)
-        x, y = np.where(none, own[0], x), np.where(none, own[1], y)
+        x, y = np.where(none, east, x), np.where(none, north, y)
     stated = (x != 0.0) | (y != 0.0)
     per_degree = np.select([units == ARC_SECONDS, units == DEGREES], [3600.0, 1.0], np.nan)
     longitude, latitude = (
@@ -329,13 +325,9 @@ class _Clock:
 
     def stamps(self, file: segyio.SegyFile, questions: list[str]) -> list[int]:
         """Return the stamps (T,) of all traces, ns."""
-        import segyio
-
-        fields = segyio.TraceField
         names = ('YearDataRecorded', 'DayOfYear', 'HourOfDay', 'MinuteOfHour', 'SecondOfMinute')
-        year, day, hour, minute, second = (
-            file.attributes(getattr(fields, name))[:].astype(np.int64) for name in names
-        )
+        words = _words(file, *names, 'TimeBaseCode')
+        year, day, hour, minute, second, base = (word.astype(np.int64) for word in words)
         clock = 3600 * hour + 60 * minute + second
         year = np.where((year >= 1) & (year < 100), year + np.where(year < 70, 2000, 1900), year)
         if ((year < 1) | (year > 9999) | (day < 1)).any():
@@ -349,7 +341,7 @@ class _Clock:
             questions.append(f'trace {k + 1} is of day {day[k]} of {year[k]}, which is no date')
             return self._undated(clock, questions, questions[-1])
         seconds = 86_400 * (date + day - 1) + clock
-        base = file.attributes(fields.TimeBaseCode)[:]
+
         unknown = np.isin(base, (LOCAL, OTHER))
         if unknown.any() and not self.time_zone:
             raise BagError(

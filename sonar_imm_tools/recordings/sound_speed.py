@@ -16,6 +16,7 @@ are left out. Where more than `MOST_POINTS` remain, those are kept that the line
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 import re
 
@@ -48,18 +49,22 @@ def read_profile(path: Path) -> Profile:
     start = start_of(path)
     try:
         with path.open(encoding='utf-8', errors='replace') as file:
-            lines = [line.rstrip('\r\n') for _, line in zip(range(MOST_ROWS), file)]
+            lines = [line.rstrip('\r\n') for line in islice(file, MOST_ROWS)]
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from None
-    if start.startswith(b'[SVP_VERSION'):
-        pairs = _first_section(lines)
+    if start.startswith(b'[SVP_VERSION'):  # the first section of a CARIS file
+        begins = [k for k, line in enumerate(lines) if line.lower().startswith('section')]
+        begin, stop = [*begins, len(lines)][:2] if begins else (1, len(lines))
+        pairs = _pairs(lines[begin + 1 : stop], 0, 1)
     elif start.lstrip().startswith(b'('):
-        pairs = list(_pairs(lines[1:], 0, 1))
-    elif b'*END*' in start or start.startswith(b'* Sea-Bird'):
-        pairs = _seabird(path, lines)
+        pairs = _pairs(lines[1:], 0, 1)
+    elif b'*END*' in start or start.startswith(b'* Sea-Bird'):  # CNV, which names its columns
+        names = [line.partition('=')[2].strip() for line in lines if line.startswith('# name ')]
+        end = next((k for k, line in enumerate(lines) if line.startswith('*END*')), len(lines))
+        pairs = _pairs(lines[end + 1 :], *_columns(path, names))
     else:
         pairs = _table(path, lines)
-    return _cleaned(path, np.array(pairs, np.float64).reshape(-1, 2))
+    return _cleaned(path, np.array(list(pairs), np.float64).reshape(-1, 2))
 
 
 def _pairs(lines: list[str], depth: int, speed: int) -> Iterator[tuple[float, float]]:
@@ -73,23 +78,7 @@ def _pairs(lines: list[str], depth: int, speed: int) -> Iterator[tuple[float, fl
                 continue
 
 
-def _first_section(lines: list[str]) -> list[tuple[float, float]]:
-    """Return the rows of the first section of a CARIS file."""
-    begins = [k for k, line in enumerate(lines) if line.lower().startswith('section')]
-    if not begins:
-        return list(_pairs(lines[2:], 0, 1))
-    end = begins[1] if len(begins) > 1 else len(lines)
-    return list(_pairs(lines[begins[0] + 1 : end], 0, 1))
-
-
-def _seabird(path: Path, lines: list[str]) -> list[tuple[float, float]]:
-    """Return the rows of a CNV file, by the names of its columns."""
-    names = [line.partition('=')[2].strip() for line in lines if line.startswith('# name ')]
-    end = next((k for k, line in enumerate(lines) if line.startswith('*END*')), len(lines))
-    return list(_pairs(lines[end + 1 :], *_columns(path, names)))
-
-
-def _table(path: Path, lines: list[str]) -> list[tuple[float, float]]:
+def _table(path: Path, lines: list[str]) -> Iterator[tuple[float, float]]:
     """Return the rows of a table with a header, or of two columns without one."""
     filled = [line for line in lines if line.strip() and not line.startswith('#')]
     first = filled[0] if filled else ''
@@ -101,23 +90,20 @@ def _table(path: Path, lines: list[str]) -> list[tuple[float, float]]:
                 f'{path} has {len(names)} columns without names; a profile of sound speed has '
                 'the columns depth and sound_speed'
             )
-        return list(_pairs(filled, 0, 1))
-    depth, speed = _columns(path, names)
-    decimal = separator == ';' and any(',' in line for line in filled[1:])
-    rows = []
-    for line in filled[1:]:
-        cells = (line.replace(',', '.') if decimal else line).split(separator)
-        rows += list(_pairs([' '.join(cell.strip() or 'nan' for cell in cells)], depth, speed))
-    return rows
+        return _pairs(filled, 0, 1)
+    rows, columns = filled[1:], _columns(path, names)
+    if separator == ';' and any(',' in line for line in rows):
+        rows = [line.replace(',', '.') for line in rows]
+    cells = ([cell.strip() or 'nan' for cell in line.split(separator)] for line in rows)
+    return _pairs([' '.join(row) for row in cells], *columns)
 
 
 def _columns(path: Path, names: list[str]) -> tuple[int, int]:
     """Return the columns of depth and sound speed. Raises `BagError`."""
-    plain_names = [plain(name) for name in names]
 
     def find(wanted: tuple[str, ...]) -> int | None:
         for word in wanted:
-            for k, name in enumerate(plain_names):
+            for k, name in enumerate(map(plain, names)):
                 if name == word or name.startswith(f'{word}_') or len(word) > 3 and word in name:
                     return k
         return None
@@ -134,9 +120,8 @@ def _columns(path: Path, names: list[str]) -> tuple[int, int]:
 
 def _cleaned(path: Path, pairs: FloatArray) -> Profile:
     """Return the profile of a cast (n, 2) of depths and speeds. Raises `BagError`."""
-    good = np.isfinite(pairs).all(axis=1) & ~np.isclose(
-        pairs[:, :1], FLAGS, rtol=1e-6, atol=0.0
-    ).any(axis=1)
+    flagged = np.isclose(pairs[:, :1], FLAGS, rtol=1e-6, atol=0.0).any(axis=1)
+    good = np.isfinite(pairs).all(axis=1) & ~flagged
     good &= (pairs[:, 1] >= SLOWEST) & (pairs[:, 1] <= FASTEST)
     if not good.any():
         raise BagError(

@@ -9,12 +9,13 @@
 """Sources of recorded messages: rosbags for whole files, a scan of the records for damaged ones.
 
 rosbags raises many kinds of exception on damaged files. Each becomes a `BagError` or a problem of
-one sentence here.
+one sentence here, in both sources alike, with what each falls back on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from functools import lru_cache
 import os
 from pathlib import Path
@@ -47,8 +48,6 @@ MOST_LINES = 4000
 """Lines of a definition without its comments; those that are in use have some hundreds."""
 SUFFIXES = ('.mcap', '.db3', '.bag')
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
-
-
 TARGET_NAMES = 'target_names'
 """Note of a bag and of run.json: the names of targets by target ID, a mapping in JSON."""
 
@@ -132,7 +131,10 @@ class RosbagsSource:
         for reader in self._reader.readers:
             _check_definitions_of(reader)
         self._reader.open()
-        self._unpack_here()
+        for storage in self._storages():
+            # Compressed messages are handed out as they are: rosbags unpacks without a limit.
+            if getattr(getattr(storage, 'metadata', None), 'compression_mode', None) == 'message':
+                storage.metadata = storage.metadata._replace(compression_mode=None)
         if trouble := self._trouble():
             self._reader.close()
             raise BagError(f'metadata.yaml has {trouble}')
@@ -140,15 +142,11 @@ class RosbagsSource:
         self.types = self._reader.typestore
         _add_known_types(self.types, [link.msgtype for link in self._reader.connections])
 
-    def _unpack_here(self) -> None:
-        """Have compressed messages handed out as they are: rosbags unpacks without a limit."""
-        for reader in self._reader.readers:
-            storage: Any = getattr(reader, 'storage', None)
-            if getattr(getattr(storage, 'metadata', None), 'compression_mode', None) == 'message':
-                storage.metadata = storage.metadata._replace(compression_mode=None)
+    def _storages(self) -> list[Any]:
+        """What each reader of rosbags reads from; None for ROS 1."""
+        return [getattr(reader, 'storage', None) for reader in self._reader.readers]
 
     def _mcaps(self) -> list[Path]:
-        """Its files of that kind."""
         if self._path.is_dir():
             return sorted(self._path.glob('*.mcap'))
         return [self._path] if self._path.suffix == '.mcap' else []
@@ -165,12 +163,9 @@ class RosbagsSource:
         for link in links:
             if not (isinstance(link.msgcount, int) and 0 <= link.msgcount < MOST_MESSAGES):
                 return f'a message count of {visible(str(link.msgcount)[:40])}'
-        if not all(
-            isinstance(link.topic, str) and isinstance(link.msgtype, str) for link in links
-        ):
+        if not all(isinstance(text, str) for link in links for text in (link.topic, link.msgtype)):
             return 'a topic whose name or type is no text'
-        for reader in self._reader.readers:
-            storage: Any = getattr(reader, 'storage', None)
+        for storage in self._storages():
             if not isinstance(getattr(storage, 'files', []), list):
                 storage.files = []  # rosbags could not close it
                 return 'a list of files that is none'
@@ -179,17 +174,16 @@ class RosbagsSource:
     @property
     def custom_data(self) -> dict[str, str]:
         """What the recorder noted beside the messages."""
-        metadata = getattr(getattr(self._reader.readers[0], 'storage', None), 'metadata', None)
+        metadata = getattr(self._storages()[0], 'metadata', None)
         return dict(getattr(metadata, 'custom', None) or {})
 
     @property
     def unordered(self) -> bool:
         """True for MCAP without chunks: rosbags refuses it when log times are not sorted."""
-        storage = getattr(self._reader.readers[0], 'storage', None)
-        files = getattr(storage, 'storages', [storage])
+        storage = self._storages()[0]
         return any(
             hasattr(file, 'chunks') and not file.chunks and file.metadata.message_count
-            for file in files
+            for file in getattr(storage, 'storages', [storage])
         )
 
     def topics(self) -> list[TopicInfo]:
@@ -242,27 +236,18 @@ class ScanSource:
     @property
     def damage(self) -> str:
         """What is lost, and what is not, as a sentence."""
-        count, stated = self._scan.counts.total(), self._scan.stated
-        if not self._scan.lost and not self.is_short:
-            return (
-                f'{self._file} is damaged beside its messages; all {count} messages were recovered'
-            )
-        if not self._scan.lost:
-            return f'{self._file} holds {count} messages; its index says {stated}'
-        of = f' of {stated}' if stated is not None else ''
-        return (
-            f'{self._file} {self._scan.lost}; {count}{of} messages were recovered, the rest is '
-            'lost'
-        )
+        file, count, stated = self._file, self._scan.counts.total(), self._scan.stated
+        if lost := self._scan.lost:
+            of = f' of {stated}' if stated is not None else ''
+            return f'{file} {lost}; {count}{of} messages were recovered, the rest is lost'
+        if self.is_short:
+            return f'{file} holds {count} messages; its index says {stated}'
+        return f'{file} is damaged beside its messages; all {count} messages were recovered'
 
     def topics(self) -> list[TopicInfo]:
+        known, counts = self.types.fielddefs, self._scan.counts
         return [
-            TopicInfo(
-                channel.topic,
-                channel.type_name,
-                self._scan.counts[number],
-                channel.type_name in self.types.fielddefs,
-            )
+            TopicInfo(channel.topic, channel.type_name, counts[number], channel.type_name in known)
             for number, channel in self._scan.channels.items()
         ]
 
@@ -303,17 +288,14 @@ def open_sources(path: Path) -> tuple[list[Source], list[str]]:
     """
     if not path.exists():
         raise BagError(f'{path} does not exist')
-    if path.is_file():
-        if path.name == 'metadata.yaml':
-            return open_sources(path.parent)
-        if path.suffix not in SUFFIXES:
-            raise NoRecordingError(
-                path,
-                f'{path} is not a recording: the names of recordings end in '
-                f'{", ".join(SUFFIXES)}{packed_hint([path])}',
-            )
-        return _open_files([path], [])
-    return _open_directory(path)
+    if not path.is_file():
+        return _open_directory(path)
+    if path.name == 'metadata.yaml':
+        return open_sources(path.parent)
+    if path.suffix not in SUFFIXES:
+        names = f'the names of recordings end in {", ".join(SUFFIXES)}{packed_hint([path])}'
+        raise NoRecordingError(path, f'{path} is not a recording: {names}')
+    return _open_files([path], [])
 
 
 def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
@@ -339,11 +321,9 @@ def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
     if not files:
         if problems:
             raise BagError(problems[0])
-        raise NoRecordingError(
-            path,
-            f'{path} is not a recording: it holds neither metadata.yaml nor a file that '
-            f'ends in {", ".join(SUFFIXES)}{packed_hint(path.iterdir())}',
-        )
+        ends = f'ends in {", ".join(SUFFIXES)}{packed_hint(path.iterdir())}'
+        sentence = f'it holds neither metadata.yaml nor a file that {ends}'
+        raise NoRecordingError(path, f'{path} is not a recording: {sentence}')
     if not problems and not (path / 'metadata.yaml').exists():
         problems.append(f'{path} has no metadata.yaml, its files are read one by one')
     return _open_files(files, problems)
@@ -357,13 +337,12 @@ def _open_files(files: list[Path], problems: list[str]) -> tuple[list[Source], l
         try:
             source, damage = _open_file(file)
         except Exception as error:  # see the module docstring
-            sentence = f'{file} cannot be read: {one_line(error)}'
-            if file.suffix == '.db3':
-                sentence += f' (sqlite3 {file.name} .recover may save some of it)'
-            failures.append(sentence)
-            continue
-        sources.append(source)
-        problems += damage + leftovers(file)
+            recover = f' (sqlite3 {file.name} .recover may save some of it)'
+            hint = recover if file.suffix == '.db3' else ''
+            failures.append(f'{file} cannot be read: {one_line(error)}{hint}')
+        else:
+            sources.append(source)
+            problems += damage + leftovers(file)
     if not sources:
         raise BagError('; '.join(failures))
     return sources, problems + failures
@@ -378,21 +357,19 @@ def _open_file(file: Path) -> tuple[Source, list[str]]:
             raise
         scan = ScanSource(file)
         return scan, [scan.damage]
-    if source.unordered:
-        source.close()
-        scan = ScanSource(file)
-        return scan, [scan.damage] if scan.is_short else []
-    return source, []
+    if not source.unordered:
+        return source, []
+    source.close()
+    scan = ScanSource(file)
+    return scan, [scan.damage] if scan.is_short else []
 
 
 def _unpacked(raw: bytes) -> bytes:
     """Undo the compression of a message; one that cannot be unpacked stays as it is."""
-    if raw[:4] != _ZSTD_MAGIC:
-        return bytes(raw)
-    try:
-        return unpack(raw, 'zstd')
-    except (TooLargeError, zstd.ZstdError):
-        return bytes(raw)
+    with suppress(TooLargeError, zstd.ZstdError):
+        if raw[:4] == _ZSTD_MAGIC:
+            return unpack(raw, 'zstd')
+    return bytes(raw)
 
 
 def _require_regular(path: Path) -> None:

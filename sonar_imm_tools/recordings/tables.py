@@ -9,12 +9,12 @@
 """Tables of any origin: any names of columns, any unit of time.
 
 Columns are found by their usual names (`columns`); columns with other names are mapped by hand.
-A row that cannot be read raises `BadRow`.
+A row that cannot be read raises `BadRow`. Rows and their table need each other, so both are here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 import contextlib
 from decimal import Decimal
 import functools
@@ -44,7 +44,7 @@ from .columns import (
     YES,
     zone_in,
 )
-from .options import nanoseconds, option
+from .convert_options import CsvOptions, TIME_UNITS
 from .sources import BagError
 from .times import (
     BadRow,
@@ -56,19 +56,12 @@ from .times import (
     hhmmss,
     moment_ns,
     of_gps_ns,
-    ORDERS,
     orders_of,
     split_time,
     text_of_days,
     TIME_OF_DAY,
     TIME_TEXT,
-    zone_of,
 )
-
-TIME_UNITS = {
-    's': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1,
-    'min': 60 * 10**9, 'h': 3600 * 10**9, 'd': 86400 * 10**9,
-}  # fmt: skip
 
 LONGEST_NS = 10**8 * 10**9
 """A recording is shorter, a date since 1970 longer."""
@@ -90,53 +83,6 @@ _NO_WORDS, _WORDS = (
 )
 
 
-@frozen(kw_only=True)
-class CsvOptions:
-    """How to read a CSV file.
-
-    columns: what is not listed is found by its usual names (`ALIASES`); case and units are
-    ignored. time_zone, empty: UTC where the header says so (``utc_time``), else times without a
-    zone are refused. time_unit, empty: from the header (``time_ms``), else s; ISO 8601 texts are
-    recognised, also as a date and a time of day in two columns.
-    """
-
-    # fmt: off
-    columns: Mapping[str, str] = option({}, 'NAME=HEADER',
-        'Header of a column of {what}, e.g. x=easting.', flag='column', kind='pairs')
-    time_zone: str = option('', 'ZONE',
-        'Zone of times in {what} that do not say it: UTC, +02:00 or Europe/Berlin.')
-    time_unit: str = option('', 'UNIT',
-        'Unit of numeric times in {what}: s, ms, us, ns, min, h or d; HHMMSS for a time of day in '
-        'one number; days of MATLAB (datenum), a spreadsheet (excel), or the Julian calendar '
-        '(julian, mjd); seconds of GPS time (gps).',
-        choices=('', *TIME_UNITS, HHMMSS, *DAYS, GPS))
-    date_order: str = option('', 'ORDER',
-        'Order of day, month and year in dates such as 05/06/24 in {what}.',
-        choices=('', *ORDERS))
-    time_offset_ns: int = option(0, 'SECONDS',
-        'Added to every time of {what}.', flag='time-offset', parse=nanoseconds)
-    delimiter: str = option('', '',
-        'Delimiter between the columns of {what}; found automatically by default.')
-    ignore: Sequence[str] = option((), 'NAME',
-        'Quantity of {what} to leave out though a column has its name, e.g. id.', many=True)
-    # fmt: on
-
-    def __attrs_post_init__(self) -> None:
-        units = (*TIME_UNITS, HHMMSS, *DAYS, GPS)
-        if self.time_unit not in ('', *units):
-            raise BagError(
-                f"the time unit must be one of {', '.join(units)}, got '{self.time_unit}'"
-            )
-        if self.time_zone:
-            zone_of(self.time_zone)
-        for name in (*self.columns, *self.ignore):
-            if name not in ALIASES:
-                raise BagError(
-                    f"there is no quantity '{name}' to map a column to"
-                    f'{did_you_mean(name, ALIASES)}'
-                )
-
-
 @frozen
 class Row:
     """One line of data; the methods raise `BadRow`."""
@@ -150,6 +96,10 @@ class Row:
         self.table.used.add(name)
         index = self.table.index.get(name, len(self.cells))
         return self.cells[index].strip() if index < len(self.cells) else ''
+
+    def bad(self, name: str, why: str, reason: str = '') -> BadRow:
+        """The error of a row whose cell cannot be used: its header, its text, and `why`."""
+        return BadRow(f"{self.table.header(name)} is '{self.text(name)[:40]}'{why}", reason)
 
     def number(self, name: str) -> float:
         """A number that has to be there and finite. Raises `BadRow`."""
@@ -165,14 +115,13 @@ class Row:
     def optional(self, name: str) -> float:
         """A number in the unit of its quantity (`columns.UNITS`); NaN when the cell is empty,
         missing or NaN."""
-        text = self.text(name)
-        if text.lower() in NOTHING:
+        if self.empty(name):
             return math.nan
         number = self._with_point(name)
         try:
             value = float(number)
         except ValueError:
-            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a number") from None
+            raise self.bad(name, ', not a number') from None
         if math.isinf(value):
             raise BadRow(f'{self.table.header(name)} is infinite')
         return value * self.table.factor(name)
@@ -187,9 +136,9 @@ class Row:
             mark = ',' if comma > point else '.'
             return text.replace('.' if mark == ',' else ',', '').replace(mark, '.')
         if _THOUSANDS.match(text) and not self.table.decimal_comma:
-            raise BadRow(
-                f"{self.table.header(name)} is '{text[:40]}': the comma may be that of thousands "
-                'or a decimal one; write a decimal point'
+            raise self.bad(
+                name,
+                ': the comma may be that of thousands or a decimal one; write a decimal point',
             )
         return text.replace(',', '.')
 
@@ -208,29 +157,21 @@ class Row:
         flag = self.text(name).lower()
         if self.table.flags(name) == {'a', 'v'}:  # active and void, as in NMEA
             flag = {'a': 'ok', 'v': 'no'}.get(flag, flag)
-        if not flag or {flag, plain(flag)} & set(YES):
-            return
-        if {flag, plain(flag)} & set(NO):
-            raise BadRow('the row is flagged as invalid', 'flagged invalid')
-        raise BadRow(f"{self.table.header(name)} is '{flag[:40]}', neither true nor false")
+        if flag and {flag, plain(flag)}.isdisjoint(YES):
+            if not {flag, plain(flag)}.isdisjoint(NO):
+                raise BadRow('the row is flagged as invalid', 'flagged invalid')
+            raise BadRow(f"{self.table.header(name)} is '{flag[:40]}', neither true nor false")
 
     def seconds_ns(self, name: str) -> int:
         """A duration or a time as integer nanoseconds, exactly as written."""
-        text = self.text(name)
         try:
-            value = Decimal(self._with_point(name))
-            nanoseconds = value * self.table.time_scale(name)
+            nanoseconds = Decimal(self._with_point(name)) * self.table.time_scale(name)
             if not abs(nanoseconds) < 2**63:
-                raise BadRow(
-                    f"{self.table.header(name)} is '{text[:40]}', beyond the year 2262; "
-                    'is the time unit right (--time-unit ms, us or ns)?'
-                )
+                why = 'is the time unit right (--time-unit ms, us or ns)?'
+                raise self.bad(name, f', beyond the year 2262; {why}')
             return round(nanoseconds)
         except ArithmeticError:
-            raise BadRow(
-                f"{self.table.header(name)} is '{text[:40]}', not a time: a number or "
-                '2024-05-31T10:00:00Z'
-            ) from None
+            raise self.bad(name, ', not a time: a number or 2024-05-31T10:00:00Z') from None
 
     def stamp_ns(self, name: str = 'stamp') -> int:
         """A time since 1970 in integer nanoseconds, with the offset of the options added."""
@@ -240,9 +181,7 @@ class Row:
             if self.table.time_form(name) == GPS:
                 stamp = of_gps_ns(stamp)
             if 0 <= stamp <= 86400 * 10**9 and self.table.has('date') and name == 'stamp':
-                order = self.table.date_order('date')
-                day = dated(self.text('date'), '00:00', self.table.header('date'), order)
-                stamp += moment_ns(day, lambda: self._zone(name)) or 0
+                stamp += moment_ns(self._dated('00:00'), lambda: self._zone(name)) or 0
         if name == 'stamp':
             stamp = self._with_fraction(stamp)
         stamp += self.table.options.time_offset_ns
@@ -258,17 +197,18 @@ class Row:
     def _with_fraction(self, stamp_ns: int) -> int:
         """A time with the part of a second that stands in a column of its own."""
         unit = self.table.fraction_unit
-        if not unit:
-            return stamp_ns
-        own = round(self.number('fraction') * unit)
+        own = round(self.number('fraction') * unit) if unit else 0
         if stamp_ns % 10**9 == 0:
             return stamp_ns + own
-        if abs(stamp_ns % 10**9 - own) > unit:
-            raise BadRow(
-                f'{self.table.header("stamp")} has another part of a second than '
-                f'{self.table.header("fraction")}'
-            )
+        if unit and abs(stamp_ns % 10**9 - own) > unit:
+            stamp, fraction = map(self.table.header, ('stamp', 'fraction'))
+            raise BadRow(f'{stamp} has another part of a second than {fraction}')
         return stamp_ns
+
+    def _dated(self, clock: str) -> str:
+        """A time of day with the date of its own column."""
+        header, order = self.table.header('date'), self.table.date_order('date')
+        return dated(self.text('date'), clock, header, order)
 
     def _moment(self, name: str) -> str:
         """The text of a time, with the date of its own column where it has only a time of day."""
@@ -283,28 +223,18 @@ class Row:
                 moment = text_of_days(days, form)
             except (ArithmeticError, ValueError):
                 return text
-            if not 0 <= days < 1 or not self.table.has('date'):
-                return moment
-            return dated(
-                self.text('date'),
-                moment[11:],
-                self.table.header('date'),
-                self.table.date_order('date'),
-            )
+            own_date = 0 <= days < 1 and self.table.has('date')
+            return self._dated(moment[11:]) if own_date else moment
         clock = hhmmss(text) if form == HHMMSS else text
         if form == HHMMSS and not clock:
-            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a time as HHMMSS")
+            raise self.bad(name, ', not a time as HHMMSS')
         if not TIME_OF_DAY.match(clock):
             return text
         if not self.table.has('date'):
-            raise BadRow(
-                f"{self.table.header(name)} is '{text[:40]}', a time of day"
-                f'{" as HHMMSS" if form == HHMMSS else ""}, and no column holds the date: add '
-                'one, named date',
-                'no date',
-            )
-        order = self.table.date_order('date')
-        return dated(self.text('date'), clock, self.table.header('date'), order)
+            what = f'a time of day{" as HHMMSS" if form == HHMMSS else ""}'
+            why = f', {what}, and no column holds the date: add one, named date'
+            raise self.bad(name, why, 'no date')
+        return self._dated(clock)
 
     def _zone(self, name: str) -> str:
         """The zone of a time that does not say it."""
@@ -313,11 +243,8 @@ class Row:
         for header in (self.table.with_unit(name), self.table.with_unit('date')):
             if zone := zone_in(header):
                 return zone
-        raise BadRow(
-            f"{self.table.header(name)} is '{self.text(name)[:40]}' without a time zone; say "
-            '--time-zone UTC, or that of the clock, e.g. --time-zone +02:00',
-            'no time zone',
-        )
+        how = '--time-zone UTC, or that of the clock, e.g. --time-zone +02:00'
+        raise self.bad(name, f' without a time zone; say {how}', 'no time zone')
 
 
 class Table:
@@ -455,13 +382,13 @@ class Table:
 
     def columns_used(self) -> tuple[str, str]:
         """What was taken from which column so far, and which columns were not, as text."""
-        taken = {name: self.index[name] for name in self.index if name in self.used}
-        columns = ', '.join(
+        taken = {name: k for name, k in self.index.items() if name in self.used}
+        columns = (
             name if self.headers[k] == name else f'{name} = {self.headers[k]}'
             for name, k in taken.items()
         )
-        left = [header for k, header in enumerate(self.headers) if k not in taken.values()]
-        return columns, ', '.join(header or '(no name)' for header in left)
+        left = (header for k, header in enumerate(self.headers) if k not in taken.values())
+        return ', '.join(columns), ', '.join(header or '(no name)' for header in left)
 
     def header(self, name: str) -> str:
         """What the file calls a quantity."""
@@ -526,13 +453,13 @@ class Table:
                 )
             by_hand[name] = self.headers.index(header)
         found = dict(by_hand)
-        usual = [quantities_of(header) for header in self.headers]
+        usual = {
+            k: quantities_of(header)
+            for k, header in enumerate(self.headers)
+            if k not in by_hand.values()
+        }
         for name in ALIASES:
-            free = [
-                index
-                for index, names in enumerate(usual)
-                if name in names and index not in by_hand.values()
-            ]
+            free = [k for k, names in usual.items() if name in names]
             if name not in found and free and name not in self.options.ignore:
-                found[name] = min(free, key=lambda index: rank_of(name, self.headers[index]))
+                found[name] = min(free, key=lambda k: rank_of(name, self.headers[k]))
         return found

@@ -48,7 +48,6 @@ SHORTEST_STEP = 2e-3
 """Seconds; no instrument gives positions more often."""
 _DIGITS = re.compile(r'(\d+)([.,]\d+)?$')
 
-
 LEAPS = (
     362793600, 394329600, 425865600, 489024000, 567993600, 631152000, 662688000, 709948800,
     741484800, 773020800, 820454400, 867715200, 915148800, 1136073600, 1230768000, 1341100800,
@@ -107,8 +106,7 @@ def zone_of(name: str) -> tzinfo:
 def moment_ns(text: str, zone: Callable[[], str]) -> int | None:
     """Nanoseconds since 1970 of a date and a time of day, in the zone that `zone` gives where the
     text names none; None for other texts. Raises `BadRow` and `BagError`."""
-    parts = TIME_TEXT.match(text)
-    if parts is None:
+    if (parts := TIME_TEXT.match(text)) is None:
         return None
     date, clock, fraction, named = parts.groups()
     return iso_ns(date, clock, fraction, zone_of(named or zone()))
@@ -128,9 +126,8 @@ def iso_ns(date: str, clock: str, fraction: str | None, zone: tzinfo) -> int:
             'then; say --time-zone with an offset, e.g. +01:00',
             'clock change',
         )
-    elapsed = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
-    nanoseconds = (elapsed.days * 86400 + elapsed.seconds + leap) * 10**9
-    return nanoseconds + round(Decimal('0.' + (fraction or '.0')[1:]) * 10**9)
+    seconds = (moment - datetime(1970, 1, 1, tzinfo=timezone.utc)) // timedelta(seconds=1) + leap
+    return seconds * 10**9 + round(Decimal('0.' + (fraction or '.0')[1:]) * 10**9)
 
 
 def clock_text(text: str) -> str:
@@ -149,9 +146,7 @@ def dated(date: str, clock: str, header: str, order: str = '') -> str:
     `ORDERS`, empty where it is not known. Raises `BadRow` for a date that can be read in several
     ways."""
     orders = orders_of([date])
-    if not order or order not in orders:
-        order = orders[0] if len(orders) == 1 else ''
-    if not order:
+    if order not in orders and len(orders) != 1:
         flags = ' or '.join(f'--date-order {each}' for each in orders)
         several = f'can be read in several ways: say {flags}, or'
         raise BadRow(
@@ -159,6 +154,7 @@ def dated(date: str, clock: str, header: str, order: str = '') -> str:
             'write 2024-05-31',
             'date in several ways' if orders else 'no date',
         )
+    order = order if order in orders else orders[0]
     year, month, day = (_parts(date)[place] for place in ORDERS[order])
     number = int(month) if month.isdecimal() else _month(month)
     return f'{int(year) + 2000 * (len(year) == 2)}-{number:02d}-{int(day):02d} {clock_text(clock)}'
@@ -166,11 +162,9 @@ def dated(date: str, clock: str, header: str, order: str = '') -> str:
 
 def _parts(date: str) -> list[str]:
     """The three parts of a date, numbers or the name of a month; empty for other texts."""
-    parts = plain(date).split('_')
-    if len(parts) == 1 and len(date) == 8 and date.isdecimal():
-        parts = [date[:4], date[4:6], date[6:]]
-    if len(parts) == 1 and len(date) == 6 and date.isdecimal():
-        parts = [date[:2], date[2:4], date[4:]]
+    parts, year = plain(date).split('_'), len(date) - 4
+    if len(parts) == 1 and year in (2, 4) and date.isdecimal():
+        parts = [date[:year], date[year:-2], date[-2:]]
     numbers = sum(part.isdecimal() and len(part) in (1, 2, 4) for part in parts)
     named = sum(_month(part) > 0 for part in parts)
     return parts if len(parts) == 3 and numbers + named == 3 and numbers >= 2 else []

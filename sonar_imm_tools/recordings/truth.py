@@ -9,9 +9,8 @@
 """Truth as messages, below the topic ``/truth``, also from a CSV of positions; simulated scenes as
 bags, each measurement on the input topic of its tracker.
 
-A velocity that the file does not state comes from central differences of the positions
-(`numpy.gradient`, uneven steps allowed). It is as noisy as the positions: with one position per
-second and 0.5 m of noise it is good to about 0.4 m/s. A single position has the velocity NaN.
+A velocity that the file does not state comes from central differences of the positions. It is as
+noisy as these: with one position per second and 0.5 m of noise it is good to about 0.4 m/s.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ from .conversion import ConversionReport, converter, flags_of, Record, write_bag
 from .convert_options import TruthOptions
 from .messages import ros_message
 from .places import LocalFrame
+from .table_files import open_table
 from .tables import CsvOptions, Row
-from .track_files import open_table
 from .writer import BagWriter
 
 TRUTH_TOPIC = '/truth/estimate'
@@ -42,16 +41,12 @@ TRUTH_TOPIC = '/truth/estimate'
 def records_of(true: Truth, frame_id: str) -> list[Record]:
     """The messages of a truth; `frame_id` is for one without a frame of its own."""
     prefix, _, name = TRUTH_TOPIC.rpartition('/')
-    return [
-        (
-            table.stamp_ns,
-            prefix + namespaced(table.namespace, f'/{name}'),
-            encode_table(
-                table.columns, stamp_ns=table.stamp_ns, frame_id=table.frame_id, make=ros_message
-            ),
-        )
-        for table in true.tables(frame_id)
-    ]
+    records = []
+    for table in true.tables(frame_id):
+        columns, stamp, frame = table.columns, table.stamp_ns, table.frame_id
+        message = encode_table(columns, stamp_ns=stamp, frame_id=frame, make=ros_message)
+        records.append((stamp, prefix + namespaced(table.namespace, f'/{name}'), message))
+    return records
 
 
 def namespaced(namespace: str, topic: str) -> str:
@@ -71,15 +66,14 @@ def convert_truth(path: Path, how: TruthOptions, report: ConversionReport) -> No
 
 
 def truth_records(
-    path: str | Path,
-    report: ConversionReport,
-    options: CsvOptions | None,
-    frame_id: str,
-    origin: tuple[float, ...] | None,
+    how: Any, report: ConversionReport, origin: tuple[float, ...] | None
 ) -> list[Record]:
-    """Read the truth beside another file into records; bad rows and notes go to `report`."""
+    """Read the truth beside another file into records, none where the options `how` name no file;
+    bad rows and notes go to `report`."""
+    if how.truth is None:
+        return []
     with flags_of('truth', report):
-        return _records(path, report, options, frame_id, origin)
+        return _records(how.truth, report, how.truth_options, how.frame_id, origin)
 
 
 def _records(
@@ -99,14 +93,12 @@ def _records(
         return row.stamp_ns(), row.text('id'), [*frame.position(row), *velocity]
 
     rows = [parsed for _, parsed in report.read_rows(table, parse)]
-    numbers = number_names([name for _, name, _ in rows])
     records = []
-    for name, track_id in numbers.items():
-        chosen = [(stamp, values) for stamp, owner, values in rows if owner == name]
-        stamps = np.array([stamp for stamp, _ in chosen], np.int64)
-        values = np.array([values for _, values in chosen])
-        stamps, first = np.unique(stamps, return_index=True)
-        position, velocity = values[first, :3], values[first, 3:]
+    for name, track_id in number_names([name for _, name, _ in rows]).items():
+        own = [stamp for stamp, owner, _ in rows if owner == name]
+        stamps, first = np.unique(np.array(own, np.int64), return_index=True)
+        values = np.array([values for _, owner, values in rows if owner == name])[first]
+        position, velocity = values[:, :3], values[:, 3:]
         if not with_velocity:
             velocity = difference_velocity(stamps, position[:, :2])
         records += records_of(TrueTrack(track_id, stamps, position, velocity), frame_id)
@@ -154,17 +146,18 @@ def write_scene(
             for measurement in entry.measurements:
                 inputs.setdefault(measurement, entry)
     records: list[Record] = []
+    images = False
     for item in scene.measurements:
         entry = inputs[type(item.measurement)]
+        images |= bool(entry.makes)
         topic = namespaced(item.namespace, f'/{entry.name}')
         records.append((item.received_ns, topic, entry.write(item.measurement, ros_message)))
     for true in scene.truth:
         records += records_of(true, scene.frame_id)
-    images = any(inputs[type(item.measurement)].makes for item in scene.measurements)
     with BagWriter(
         out, compressed=compressed or images, custom_data=provenance, parameters=parameters
     ) as bag:
         for log_ns, topic, message in sorted(records, key=lambda record: record[0]):
             bag.write(topic, message, log_ns)
-            report.messages[topic] += 1
+    report.messages = bag.counts
     return report

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 import contextlib
 import os
@@ -51,15 +52,8 @@ PLAIN = 'recording'
 """Name of the storage file in a folder whose own name metadata.yaml cannot hold."""
 
 _RELIABLE = Qos(
-    QosHistory.KEEP_LAST,
-    10,
-    QosReliability.RELIABLE,
-    QosDurability.VOLATILE,
-    QosTime(0, 0),
-    QosTime(0, 0),
-    QosLiveliness.SYSTEM_DEFAULT,
-    QosTime(0, 0),
-    False,
+    *(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE, QosTime(0, 0)),
+    *(QosTime(0, 0), QosLiveliness.SYSTEM_DEFAULT, QosTime(0, 0), False),
 )
 
 
@@ -98,7 +92,7 @@ class BagWriter:
         if storage not in STORAGES:
             raise ValueError(f"storage must be one of {', '.join(STORAGES)}, got '{storage}'")
         self.path = Path(path)
-        self.count = 0
+        self.counts: Counter[str] = Counter()
         self._links: dict[tuple[str, str], Connection] = {}
         self._chunk: tuple[int, int] | None = None
         self._parameters = {} if parameters is None else parameters
@@ -156,7 +150,7 @@ class BagWriter:
         with naming(self.path):
             self._writer.write(self._link(topic, type_name), log_ns, raw)
             self._close_chunk(log_ns, len(raw))
-        self.count += 1
+        self.counts[topic] += 1
 
     def _close_chunk(self, log_ns: int, size: int) -> None:
         """Close the chunk of an MCAP file after a message of `size` bytes, if it is time."""
@@ -169,10 +163,8 @@ class BagWriter:
             self._chunk = None
 
     def _link(self, topic: str, type_name: str) -> Connection:
-        link = self._links.get((topic, type_name))
-        if link is None:
-            link = self._writer.add_connection(
+        if (topic, type_name) not in self._links:
+            self._links[topic, type_name] = self._writer.add_connection(
                 topic, type_name, typestore=typestore(), offered_qos_profiles=[_RELIABLE]
             )
-            self._links[topic, type_name] = link
-        return link
+        return self._links[topic, type_name]

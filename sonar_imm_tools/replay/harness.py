@@ -35,8 +35,8 @@ from sonar_imm.files import lock
 from sonar_imm.nodes.stopping import ENDING
 from sonar_imm.trackers import SYSTEMS
 
+from ..recordings.measurements import fitting_topics
 from ..recordings.reader import BagReader
-from ..recordings.topics import fitting_topics
 from .link import Link, LinkError
 from .lockstep import Chain, Counts, FirstStep, LockStep, Recorder
 from .player import NAME, Player, PlayOptions

@@ -32,7 +32,7 @@ from sonar_imm.texts import visible
 from ..evaluation.plotting import COLOURS, Picture
 from ..evaluation.report import rendered
 from ..offline.run_folder import REPORT
-from ..recordings.csv_writer import CsvWriter
+from ..recordings.export import CsvWriter
 from ..recordings.sources import BagError
 from .adjustment import described, Mistie
 from .chart import BANDS, Chart, values_of, write_geotiff

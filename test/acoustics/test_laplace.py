@@ -17,7 +17,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import kve
 
-from sonar_imm.acoustics import array, coherence, interference, laplace, wave_kernels
+from sonar_imm.acoustics import array, coherence, interference, laplace
 
 STEP = array.phase_step(0.5)
 
@@ -294,20 +294,6 @@ def test_for_two_staves_the_mean_decides():
         for each in (iq, iq + wave)
     )
     assert silent > 0.99 and heard < 0.3
-
-
-def test_the_compiled_peaks_are_those_of_numpy():
-    iq = circular(np.random.default_rng(7), 300, 8)
-    gamma, sine = coherence.coherence(iq, 0.5)
-    form, grid = laplace.autocorrelation(iq), array.direction_grid(8, 0.5)
-    form[:, 1:] *= 2.0
-    height, place, *spare = (np.empty(n) for n in (300, 300, len(grid), len(grid)))
-    wave_kernels.beam_peaks(
-        form, np.cos(np.pi * grid), np.sin(np.pi * grid), *spare, height, place
-    )
-    power = np.square(np.abs(iq)).sum(axis=1)
-    assert np.allclose(height / (8.0 * power), gamma, atol=1e-12)
-    assert np.allclose(grid[0] + place * (grid[1] - grid[0]), sine, atol=1e-9)
 
 
 def test_coherence_beside_an_interferer_is_that_of_what_it_leaves():

@@ -144,6 +144,7 @@ def test_rays_are_those_of_an_independent_integration():
 def test_a_ray_turns_where_the_speed_has_grown_by_its_cosine():
     # c = 1480 + z: a ray from z = 0 at 5 degrees turns at c = 1480 / cos 5 deg.
     profile = profile_of([0.0, 1480.0, 200.0, 1680.0])
+    assert profile.at(20.0) == 1500.0
     times = np.linspace(0.0, 0.2, 2001)
     depth = trace(profile, 0.0, np.radians(5.0), times).depth
     assert depth.max() == pytest.approx(1480.0 / np.cos(np.radians(5.0)) - 1480.0, abs=1e-4)

@@ -25,10 +25,9 @@ from msg_adapters.fixes import write_geodetic
 from msg_adapters.inputs import inputs_of
 from sonar_imm.measurements import Detections, GeodeticFix, Navigation
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.measurements import fitting_topics, measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import quoted
-from sonar_imm_tools.recordings.topics import fitting_topics
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
 SHIPPED = sorted(path.name for path in (ROOT / 'bags').iterdir() if path.is_dir())

@@ -21,8 +21,8 @@ import pytest
 
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.offline.tracking import OfflineRun
+from sonar_imm_tools.recordings.measurements import fitting_topics, instruments
 from sonar_imm_tools.recordings.reader import BagReader
-from sonar_imm_tools.recordings.topics import fitting_topics, instruments
 from sonar_imm_tools.recordings.writer import BagWriter
 
 STATED = ('tilt_std_deg', 'spacing_std', 'sound_speed_std')

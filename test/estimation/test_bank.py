@@ -326,6 +326,7 @@ def test_a_row_that_is_lost_keeps_its_weight_and_gets_a_row_again(seed):
         assert sorted(scales) == sorted(own)
     parents = by_name(thin, thin.parent)
     assert all(parents[int(n)] == p for n, p in zip(back.key['name'], back.parent))
+    assert len(Borrowed(lent.target[:0], {}, lent.logw[:0]).find_lenders(thin)) == 0
     lender = lent.find_lenders(thin)
     assert np.array_equal(thin.target[lender], lent.target)
     heaviest = np.maximum.reduceat(thin.logw, thin.first)

@@ -100,9 +100,9 @@ def test_likelihoods_are_those_of_the_definition_and_amplitudes_go_with_members(
         old, new = sets.order[i], moved.order[i]
         known = dict(zip(sets.prior_mean[i, :old], zip(sets.sign[i], sets.prior_variance[i])))
         rows = list(zip(moved.prior_mean[i, :new], moved.sign[i], moved.prior_variance[i]))
-        kept = [(sign, variance) == known[m] for m, sign, variance in rows if m in known]
+        kept = {m: (sign, variance) for m, sign, variance in rows if m in known}
         fresh = [variance for m, _, variance in rows if m not in known]
-        assert all(kept) and len(kept) == min(old, new)
+        assert all(known[m] == each for m, each in kept.items()) and len(kept) == min(old, new)
         assert fresh == [changed.amplitude_std**2] * (new - len(kept))
 
 

@@ -94,6 +94,13 @@ class Bench:
         self.peer.create_subscription(message_type, topic, received.append, qos)
         return received
 
+    def hear(self, node, qos=10, **kinds):
+        """Collect what a node publishes below its own name, a type for each topic."""
+        topics = [f'{node.get_fully_qualified_name()}/{name}' for name in kinds]
+        heard = [self.listen(kind, name, qos) for kind, name in zip(kinds.values(), topics)]
+        self.spin_until(lambda: all(map(node.count_subscribers, topics)))
+        return heard
+
     def publisher(self, kind, topic, qos=None):
         """A publisher of a type or its name that is heard."""
         cls = message_class(kind) if isinstance(kind, str) else kind

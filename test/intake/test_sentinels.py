@@ -17,11 +17,12 @@ import pytest
 
 from msg_adapters import fixes
 from msg_adapters.navigation import read_heading, read_vessel_pose, write_heading, write_navigation
-from msg_adapters.scans import read_scan, write_scan
+from msg_adapters.scans import read_scan
+from msg_adapters.table import encode_table
 from sonar_imm import measurements
 from sonar_imm.acoustics.geometry import Pose, rotation
 from sonar_imm.intake import Intake, moved
-from sonar_imm.measurements import Fix, Fixes, GeodeticFix, Rejection, RelativeFix, VesselFix
+from sonar_imm.measurements import Fix, GeodeticFix, Rejection, RelativeFix, VesselFix
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.recordings.messages import ros_message
 
@@ -35,79 +36,59 @@ HUGE_ANGLES = [0.31, math.pi**2 / 3, math.pi**2, 99.0, 1e3, 1e6, 1e10, MOST, mat
 
 
 def variances(message, *diagonal):
-    """The message with these variances and nothing beside them."""
-    size = len(message.pose.covariance)
-    whole = np.zeros((math.isqrt(size),) * 2)
-    np.fill_diagonal(whole, diagonal)
-    message.pose.covariance[:] = whole.ravel()
+    """The message with these variances, repeated, and nothing beside them."""
+    of_earth = hasattr(message, 'position_covariance')
+    stated = message.position_covariance if of_earth else message.pose.covariance
+    stated[:] = np.diag(np.resize(diagonal, math.isqrt(len(stated)))).ravel()
     return message
 
 
-def pose_of_fix(variance):
-    fix = Fix(stamp_ns=S, position=(1.0, 2.0, 0.0), frame_id='map')
-    return fixes.read_fix(variances(fixes.write_fix(fix, ros_message), *[variance] * 6))
-
-
-def of_satellites(of, read, kind):
-    def read_with(variance):
-        message = fixes.write_geodetic(of(stamp_ns=S, latitude=59.0, longitude=10.0), ros_message)
-        message.position_covariance[:] = np.diag(np.full(3, variance)).ravel()
-        message.position_covariance_type = kind
-        return read(message)
-
-    return read_with
-
-
-def of_transceiver(variance):
-    fix = RelativeFix(stamp_ns=S, offset=(30.0, 4.0, -5.0), frame_id='usbl')
-    return fixes.read_relative(variances(fixes.write_relative(fix, ros_message), *[variance] * 6))
+FIXED = Fix(stamp_ns=S, position=(1.0, 2.0, 0.0), frame_id='map')
+SEEN = RelativeFix(stamp_ns=S, offset=(30.0, 4.0, -5.0), frame_id='usbl')
+EARTH = GeodeticFix(stamp_ns=S, latitude=59.0, longitude=10.0)
+VESSEL = VesselFix(stamp_ns=S, latitude=59.0, longitude=10.0)
+ROADS = {
+    'PoseWithCovarianceStamped': (fixes.read_fix, fixes.write_fix(FIXED, ros_message), None),
+    'relative': (fixes.read_relative, fixes.write_relative(SEEN, ros_message), None),
+    'NavSatFix diagonal': (fixes.read_geodetic, fixes.write_geodetic(EARTH, ros_message), 2),
+    'NavSatFix known': (fixes.read_geodetic, fixes.write_geodetic(EARTH, ros_message), 3),
+    'of a vessel': (fixes.read_vessel_fix, fixes.write_geodetic(VESSEL, ros_message), 2),
+}
 
 
 def row_of_scan(variance):
     """A row of a table of fixes, beside a good one."""
-    places = np.array([[1.0, 2.0, 0.0], [5.0, 5.0, 0.0]])
-    stated = np.stack([np.diag([4.0, 4.0, np.nan]), np.eye(3)])
-    scan = Fixes(stamp_ns=S, position=places, covariance=stated, frame_id='map')
-    message = write_scan(scan, ros_message)
-    names = [field.name for field in message.fields]
-    rows = np.array(message.data).reshape(2, message.point_step)
-    for name in ('cov_x_x', 'cov_y_y'):
-        at = message.fields[names.index(name)].offset
-        with np.errstate(over='ignore'):
-            rows[0, at : at + 4] = np.array([variance], np.float32).view(np.uint8)
-    message.data = rows.ravel()
-    read = read_scan(message)
-    if len(read) == 1:
+    names, stated = ('x', 'y', 'cov_x_x', 'cov_x_y', 'cov_y_y'), np.array([variance, 1.0])
+    columns = dict(zip(names, (np.ones(2), np.ones(2), stated, np.zeros(2), stated)))
+    scan = read_scan(encode_table(columns, stamp_ns=S, frame_id='map', make=ros_message))
+    if len(scan) == 1:
         raise Rejection('not_measured' if variance >= 1.0 else 'out_of_range', 'left out')
-    known = not np.isnan(read.covariance[0, 0, 0])
-    return Fix(stamp_ns=S, position=read.position[0], covariance=np.eye(2) if known else None)
+    known = not np.isnan(scan.covariance[0, 0, 0])
+    return Fix(stamp_ns=S, position=scan.position[0], covariance=np.eye(2) if known else None)
 
 
-ROADS = {
-    'PoseWithCovarianceStamped': pose_of_fix,
-    'NavSatFix diagonal': of_satellites(GeodeticFix, fixes.read_geodetic, 2),
-    'NavSatFix known': of_satellites(GeodeticFix, fixes.read_geodetic, 3),
-    'NavSatFix of the vessel': of_satellites(VesselFix, fixes.read_vessel_fix, 2),
-    'relative': of_transceiver,
-    'row of a table': row_of_scan,
-}
+def by_road(road, variance):
+    if road == 'row of a table':
+        return row_of_scan(variance)
+    read, message, kind = ROADS[road]
+    if kind is not None:
+        message.position_covariance_type = kind
+    return read(variances(message, variance))
 
 
-@pytest.mark.parametrize('road', ROADS)
+@pytest.mark.parametrize('road', [*ROADS, 'row of a table'])
 def test_variances_of_x_and_y(road):
-    read = ROADS[road]
     for variance in UNKNOWN:
-        assert read(variance).covariance is None, variance
+        assert by_road(road, variance).covariance is None, variance
     for variance in (1e-10, 0.25, 99.0, 1e4):
-        assert read(variance).covariance is not None, variance
+        assert by_road(road, variance).covariance is not None, variance
     for code, refused in (('out_of_range', TINY), ('not_measured', UNMEASURED)):
-        assert [reason(read, variance) for variance in refused] == [code] * len(refused)
+        assert [reason(by_road, road, variance) for variance in refused] == [code] * len(refused)
 
 
 def test_one_axis_that_is_far_from_known_is_used():
     """As a bearing and a range from far away say it."""
-    fix = Fix(stamp_ns=S, position=(5e4, 0.0, 0.0), frame_id='map')
-    message = variances(fixes.write_fix(fix, ros_message), 4.0, 3e6, 0.0, 0.0, 0.0, 0.0)
+    message = variances(fixes.write_fix(FIXED, ros_message), 4.0, 3e6, 0.0, 0.0, 0.0, 0.0)
     assert fixes.read_fix(message).covariance[1, 1] == 3e6
 
 
@@ -119,9 +100,8 @@ def odometry(second, *diagonal):
 
 def by_heading(second, *diagonal):
     """A place on Earth that is exactly known, and the orientation of an IMU."""
-    heading = measurements.VesselHeading(
-        stamp_ns=round(second * S), orientation=STOOD, frame_id='vessel'
-    )
+    lies = {'orientation': STOOD, 'frame_id': 'vessel'}
+    heading = measurements.VesselHeading(stamp_ns=round(second * S), **lies)
     message = write_heading(heading, ros_message)
     message.orientation_covariance[:] = np.diag(diagonal[3:]).ravel()
     return read_heading(message)

@@ -37,11 +37,7 @@ SECOND = 10**9
 def rig(make_bench):
     bench = make_bench()
     node = bench.start(DiverNode)
-    odometry = bench.listen(Odometry, '/diver/odometry')
-    probabilities = bench.listen(JointState, '/diver/model_probabilities')
-    topics = '/diver/odometry', '/diver/model_probabilities'
-    bench.spin_until(lambda: all(map(node.count_subscribers, topics)))
-    return bench, node, odometry, probabilities
+    return bench, node, *bench.hear(node, odometry=Odometry, model_probabilities=JointState)
 
 
 def a_fix(stamp_ns, x, y, covariance=None):
@@ -142,8 +138,7 @@ def on_earth(k, x, status=0):
 def test_navsatfix_in_and_out(make_bench):
     bench = make_bench(p=[ON_EARTH])
     node = bench.start(DiverNode)
-    geo = bench.listen(NavSatFix, '/diver/geo')
-    bench.spin_until(lambda: node.count_subscribers('/diver/geo'))
+    (geo,) = bench.hear(node, geo=NavSatFix)
     fixes = bench.publisher(NavSatFix, '/fix')
     bench.send(node, fixes, *(on_earth(k, 0.5 * k) for k in range(1, 21)))
     bench.spin_until(lambda: geo and geo[-1].header.stamp.sec == 20)
@@ -192,10 +187,9 @@ def test_a_start_begins_a_track_and_a_useless_one_is_refused_by_name(make_bench,
 
     bench = make_bench()
     node = bench.start(DiverNode)
-    estimates = bench.listen(PointCloud2, '/diver/estimate')
+    (estimates,) = bench.hear(node, estimate=PointCloud2)
     initial = bench.publisher(POSE, '/diver/initial', 10)
     fixes = bench.publisher(POSE, '/fix', 10)
-    bench.spin_until(lambda: node.count_subscribers('/diver/estimate'))
     bench.send(node, initial, told(1, 5.0))
     bench.spin_until(lambda: estimates)
     first = read_estimate(estimates[0])

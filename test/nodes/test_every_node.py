@@ -9,6 +9,8 @@
 """Every node: live is offline, hostile input is refused, services answer. And what the nodes of a
 swath and of an array publish besides."""
 
+from importlib import import_module
+
 from helpers.node_bench import Driven
 from helpers.scenes import SMALL, smaller_scene
 from nav_msgs.msg import Odometry
@@ -26,7 +28,6 @@ from msg_adapters.navigation import write_navigation
 from msg_adapters.snapshots import write_snapshot
 from msg_adapters.soundings import read_soundings
 from sonar_imm.measurements import Navigation, Pressure
-from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.bathymetry import BathymetryNode
 from sonar_imm.nodes.fathometer import FathometerNode
 from sonar_imm.nodes.messages import make, message_class
@@ -36,6 +37,7 @@ from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.simulation.bathymetry import simulator as swath
 from sonar_imm_tools.simulation.fathometer import simulator as array
 
+SHARES = {'model_probabilities': JointState}
 MESSAGES = 60
 MORE = ('obstacle', 'late'), ('fathometer', 'small'), ('fathometer', 'pressure')
 """Messages that come late, cross-spectra, pressure."""
@@ -54,7 +56,8 @@ class Fed(Driven):
         for name, value in settings.items():
             given = list(value) if isinstance(value, tuple) else value
             overrides.append(Parameter(name, value=given))
-        node = bench.start(TrackerNode, system.name, parameter_overrides=overrides)
+        kind = getattr(import_module(system.node), f'{system.name.capitalize()}Node')
+        node = bench.start(kind, parameter_overrides=overrides)
         inputs = {topic.measurement: topic for topic in inputs_of(system.name)}
         given = [item.measurement for item in scene.measurements[:MESSAGES]]
         self.messages = [(inputs[type(m)], inputs[type(m)].write(m, make)) for m in given]
@@ -109,15 +112,10 @@ def test_with_navigation_soundings_and_shares_are_published(make_bench):
     """One node for both sides; what `~/soundings` says is what the offline table holds."""
     bench = make_bench(p=['max_wait:=0.0', 'navigation:=required'])
     node = bench.start(BathymetryNode)
-    tables = bench.listen(PointCloud2, '/bathymetry/estimate', lockstep_qos())
-    clouds = bench.listen(PointCloud2, '/bathymetry/soundings', lockstep_qos())
-    shares = bench.listen(JointState, '/bathymetry/model_probabilities', lockstep_qos())
+    kinds = {**dict.fromkeys(('estimate', 'soundings'), PointCloud2), **SHARES}
+    tables, clouds, shares = bench.hear(node, lockstep_qos(), **kinds)
     types = {'port/snapshot': PointCloud2, 'starboard/snapshot': PointCloud2, 'nav': Odometry}
     publishers = {name: bench.publisher(kind, f'/{name}') for name, kind in types.items()}
-    outputs = ('estimate', 'soundings', 'model_probabilities')
-    bench.spin_until(
-        lambda: all(node.count_subscribers(f'/bathymetry/{name}') for name in outputs)
-    )
     values = {'pings': 2, 'ping_rate': 10.0, 'last_range': 24.0}
     scene = swath.simulate(swath.scenario('moving_two_sides', values), 3)
     for item in scene.measurements:
@@ -147,13 +145,8 @@ START = 1_700_000_000 * 10**9
 def test_traces_become_reflectors_with_ids_and_displays(make_bench):
     bench = make_bench(p=['particles:=2000'])
     node = bench.start(FathometerNode)
-    outputs = ('estimate', 'response', 'model_probabilities')
-    tables = bench.listen(PointCloud2, '/fathometer/estimate')
-    responses = bench.listen(PointCloud2, '/fathometer/response')
-    numbers = bench.listen(JointState, '/fathometer/model_probabilities')
-    bench.spin_until(
-        lambda: all(node.count_subscribers(f'/fathometer/{name}') for name in outputs)
-    )
+    kinds = {**dict.fromkeys(('estimate', 'response'), PointCloud2), **SHARES}
+    tables, responses, numbers = bench.hear(node, **kinds)
     values = {'records': 4, 'appearing': (), 'fading': (), 'layers': 4}
     scene = array.simulate(array.scenario('drift_traces', values), 3)
     measured = [item.measurement for item in scene.measurements]

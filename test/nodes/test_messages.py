@@ -6,18 +6,29 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The live message factory: every field cast to what its definition asks for."""
+"""The live message factory: every field cast to what its definition asks for; tables that are
+published as bytes; and messages that never came, counted by the numbers of those that did."""
 
 import array
+import itertools
+import time
+from types import SimpleNamespace
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from helpers.node_bench import a_fix, values_of
 import numpy as np
 import pytest
+from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Float64
 
 from msg_adapters.table import decode_table, encode_table
+from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.outputs import ProcessedPublisher, TablePublisher
+from sonar_imm.nodes.qos import Endpoints, input_qos, output_qos, SequenceGaps
 
 
 def test_scalars_are_cast():
@@ -128,3 +139,118 @@ def test_every_answer_has_its_counts_and_its_stamp():
         answers.publish({'messages': messages, 'refused': 0, 'estimates': messages - 1})
         row = {name: int(column[0]) for name, column in decode_table(paper.message).items()}
         assert row == {'messages': messages, 'refused': 0, 'estimates': messages - 1}
+
+
+class Line:
+    """Publishers by name, each numbering what it sends, and the counter that hears them."""
+
+    def __init__(self, publishers=1):
+        self.publishers = publishers
+        self.numbers = {}
+        self.gaps = SequenceGaps(lambda: self.publishers)
+
+    def send(self, name='one', *, skip=0, received_ns=0):
+        number = self.numbers.get(name, 0) + 1 + skip
+        self.numbers[name] = number
+        return self.gaps.count(
+            {'publication_sequence_number': number, 'received_timestamp': received_ns}
+        )
+
+
+def test_a_gap_in_the_numbers_is_what_was_lost():
+    line = Line()
+    missed = [line.send(skip=skip) for skip in (7, 0, 0, 3, 0, 1)]
+    assert missed == [0, 0, 0, 3, 0, 1]  # what came before the first was sent to others
+    assert line.gaps.lost == 4
+    line.numbers.clear()  # a publisher that starts again loses nothing
+    assert sum(line.send() for _ in range(5)) == 0
+    assert line.send(skip=2) == 2
+    info = {'publication_sequence_number': None, 'received_timestamp': 1}
+    gaps = SequenceGaps(lambda: 1)  # nor does a middleware without numbers
+    assert (gaps.count(info), gaps.count(info), gaps.lost, gaps.numbered) == (0, 0, 0, False)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_the_losses_of_publishers_add_up(seed):
+    rng = np.random.default_rng(seed)
+    line = Line(publishers=3)
+    for name, start in zip('abc', (0, 10_000, 500_000), strict=True):
+        line.numbers[name] = start
+        line.send(name)
+    lost = 0
+    for name in rng.choice(list('abc'), 1000, p=(0.7, 0.25, 0.05)):
+        skip = int(rng.random() < 0.1) * int(rng.integers(1, 9))
+        lost += skip
+        line.send(name, skip=skip)
+    assert line.gaps.lost == lost
+
+
+def test_a_publisher_that_left_is_not_continued_by_another():
+    line = Line(publishers=2)
+    line.numbers['other'] = 60
+    for name in ('gone', 'other') * 20:
+        line.send(name)
+    line.publishers = 1
+    line.gaps.publisher_left()
+    queued = time.time_ns() - 10**9
+    line.send('gone', received_ns=queued)  # was still in the queue
+    assert sum(line.send('other', received_ns=time.time_ns()) for _ in range(5)) == 0
+    assert line.send('other', skip=3, received_ns=time.time_ns()) == 3
+    line.publishers = 2
+    line.numbers['third'] = line.numbers['gone'] + 10
+    assert line.send('third', received_ns=time.time_ns()) == 0
+
+
+def test_the_real_middleware_numbers_messages_and_the_queue_is_counted(make_bench, capfd):
+    bench = make_bench()
+    received = []
+    endpoints = Endpoints(bench.peer)
+    endpoints.subscribe(Float64, 'depth', lambda m, _: received.append(m.data), input_qos(10))
+    writer = bench.start(Node, 'writer', use_global_arguments=False)
+    publishers = [writer.create_publisher(Float64, 'depth', 1000) for _ in range(2)]
+    bench.spin_until(lambda: all(item.get_subscription_count() for item in publishers))
+    sent = itertools.count()
+    for publisher in publishers:
+        publisher.publish(Float64(data=float(next(sent))))
+    bench.spin_until(lambda: len(received) == 2)
+    assert not endpoints.lost
+    for publisher in publishers * 100:  # while the node is busy
+        publisher.publish(Float64(data=float(next(sent))))
+    bench.spin_until(lambda: 201.0 in received)
+    assert endpoints.lost == {'depth': 202 - len(received)}
+    assert len(received) <= 2 + 10
+    assert capfd.readouterr().err.count("'depth' are lost before") == 1
+
+
+def test_a_middleware_without_numbers_is_believed_what_it_says_was_lost(make_bench):
+    endpoints = Endpoints(make_bench().peer)
+    endpoints.subscribe(Float64, 'depth', lambda *_: None, input_qos(10))
+    endpoints._lost('depth', SimpleNamespace(total_count=7))
+    endpoints._gaps['depth'].count({'publication_sequence_number': None, 'received_timestamp': 1})
+    assert endpoints.lost == {'depth': 7}
+    for number in (1, 4):  # with numbers they count alone, since both may know of the same
+        info = {'publication_sequence_number': number, 'received_timestamp': 1}
+        endpoints._gaps['depth'].count(info)
+    assert endpoints.lost == {'depth': 2}
+
+
+@pytest.mark.usefixtures('quick')
+def test_a_node_warns_of_the_share_that_it_lost(make_bench, walker):
+    bench = make_bench(p=['qos_overrides./fix.subscription.depth:=5'])
+    node = bench.start(TrackerNode, 'walker')
+    given = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    fix, message = bench.publisher(PoseWithCovarianceStamped, 'fix', 100), a_fix(1.0)
+    bench.send(node, fix, message)
+    for _ in range(100):
+        fix.publish(message)
+    bench.spin_until(lambda: any('are lost before' in item.status[0].message for item in given))
+    statuses = [item.status[0] for item in given]
+    printed = next(status for status in statuses if 'are lost before' in status.message)
+    assert printed.level == DiagnosticStatus.WARN
+    assert '% on fix' in printed.message
+
+    def lost():
+        return int(values_of(given[-1])['lost on fix'])
+
+    bench.spin_until(lambda: lost() == 101 - node._meter.received['fix'])
+    assert lost() > 90

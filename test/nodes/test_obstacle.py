@@ -32,10 +32,8 @@ from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 def rig(make_bench):
     bench = make_bench(p=['max_wait:=0.0'])
     kinds = {'obstacles': PoseArray, 'markers': MarkerArray, 'model_probabilities': JointState}
-    topics = {f'/obstacle/{name}': kind for name, kind in kinds.items()}
     node = bench.start(ObstacleNode)
-    poses, markers, probabilities = (bench.listen(kind, name) for name, kind in topics.items())
-    bench.spin_until(lambda: all(map(node.count_subscribers, topics)))
+    poses, markers, probabilities = bench.hear(node, **kinds)
     return SimpleNamespace(
         bench=bench, node=node, poses=poses, markers=markers, probabilities=probabilities
     )

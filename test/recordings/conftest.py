@@ -14,8 +14,8 @@ import pytest
 from msg_adapters.fixes import write_fix
 from sonar_imm.measurements import Fix
 from sonar_imm_tools.recordings.convert import KINDS
-from sonar_imm_tools.recordings.csv_table import CsvTable
 from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.table_files import CsvTable
 from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.writer import BagWriter
 

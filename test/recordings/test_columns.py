@@ -13,8 +13,8 @@ from helpers.field_files import measured
 import pytest
 
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.convert import sniff
 from sonar_imm_tools.recordings.places import Degrees
-from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.times import BadRow

@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from sonar_imm_tools.recordings.csv_table import CsvTable
 from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.table_files import CsvTable
 from sonar_imm_tools.recordings.tables import CsvOptions
 from sonar_imm_tools.recordings.times import BadRow
 

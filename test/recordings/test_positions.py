@@ -30,11 +30,10 @@ from sonar_imm_tools.offline.inspection import inspect
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.offline.tracking import InputOptions, OfflineRun, write_run
 from sonar_imm_tools.recordings import positions
-from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.measurements import fitting_topics, measurements_of
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.positions import GAP_S
 from sonar_imm_tools.recordings.reader import BagError, BagReader
-from sonar_imm_tools.recordings.topics import fitting_topics
 from sonar_imm_tools.recordings.truth import records_of
 from sonar_imm_tools.recordings.writer import BagWriter
 

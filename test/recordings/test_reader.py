@@ -6,6 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
+import contextlib
 import shutil
 import sqlite3
 import struct
@@ -145,6 +146,9 @@ class TestWhole:
         file = storage_file(path)
         assert len(read(file)[0]) == 50 and not read(file)[1]
         assert len(read(path / 'metadata.yaml')[0]) == 50
+        file.rename(path / f'other{file.suffix}')
+        items, problems = read(path)
+        assert len(items) == 50 and 'missing' in problems[0]
         (path / 'metadata.yaml').unlink()
         items, problems = read(path)
         assert len(items) == 50 and len(problems) == 1 and 'no metadata.yaml' in problems[0]
@@ -273,75 +277,59 @@ class TestDamage:
         with pytest.raises(BagError, match='message 1'):
             read(tmp_path / 'bag', strict=True)
 
-    def test_missing_files_of_the_metadata(self, write_fixes):
-        path = write_fixes()
-        storage_file(path).rename(path / 'other.mcap')
-        items, problems = read(path)
-        assert len(items) == 50 and 'missing' in problems[0]
-
-    @pytest.mark.parametrize(
-        'name, content',
-        [
+    def test_what_is_no_recording_is_one_sentence(self, tmp_path):
+        for k, (name, content) in enumerate((
             ('no', None), ('x.mcap', b''), ('x.mcap', b'nonsense'), ('x.db3', b'nonsense' * 100),
             ('x.bag', b'nonsense'), ('x.txt', b''), ('x.mcap.zstd', b''), ('dir', 'dir'),
             ('x.mcap', b'\x89MCAP0\r\n'), ('x.bag', b''),
-        ],
-    )  # fmt: skip
-    def test_what_is_no_recording_is_one_sentence(self, tmp_path, name, content):
-        path = tmp_path / name
-        if content == 'dir':
-            path.mkdir()
-        elif content is not None:
-            path.write_bytes(content)
-        try:
-            items, problems = read(path)
-        except BagError as error:
-            assert str(path) in error.sentence and '\n' not in error.sentence
-        else:
-            assert not items and 'cut off' in problems[0]
-
-
-class TestTypes:
-    def add_custom(self, path, gone=''):
-        """Write /custom of a type nobody knows, and /text, into an sqlite3 bag; gone: which
-        definitions it lacks, in SQL."""
-        store = get_typestore(Stores.ROS2_JAZZY)
-        store.register(get_types_from_msg('float64 value', CUSTOM))
-        with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
-            for log_ns, topic, kind, values in (
-                (1, '/custom', CUSTOM, {'value': 2.5}),
-                (2, '/text', 'std_msgs/msg/String', {'data': 'hello'}),
-            ):
-                link = writer.add_connection(topic, kind, typestore=store)
-                message = store.types[kind](**values)
-                writer.write(link, log_ns, store.serialize_cdr(message, kind))
-        if gone:
-            with sqlite3.connect(storage_file(path)) as database:
-                database.execute(f'delete from message_definitions where topic_type {gone}')
-            database.close()
-
-    def test_a_type_defined_in_the_bag_is_read_and_a_known_one_needs_no_definition(self, tmp_path):
-        """Where none is in the bag, and where only those of other types are."""
-        both = ['/custom', '/text']
-        for gone, topics in (('', both), ("like '%'", both[1:]), ("like 'std_msgs%'", both)):
-            path = tmp_path / f'bag{len(gone)}'
-            self.add_custom(path, gone)
-            items, problems = read(path)
-            assert [item.topic for item in items] == topics
-            if topics == both:
-                assert items[0].message.value == 2.5 and not problems
+        )):  # fmt: skip
+            path = tmp_path / f'{k}_{name}'
+            if content == 'dir':
+                path.mkdir()
+            elif content is not None:
+                path.write_bytes(content)
+            try:
+                items, problems = read(path)
+            except BagError as error:
+                assert str(path) in error.sentence and '\n' not in error.sentence
             else:
-                assert CUSTOM in problems[0]
+                assert not items and 'cut off' in problems[0]
 
-    def test_an_undefined_type_is_told_and_the_rest_is_read(self, tmp_path):
-        self.add_custom(tmp_path / 'bag', f"= '{CUSTOM}'")
-        with BagReader(tmp_path / 'bag') as bag:
-            known = [(topic.name, topic.decodable) for topic in bag.topics]
-            assert known == [('/custom', False), ('/text', True)]
-            assert CUSTOM in bag.problems[0]
-            assert [item.message.data for item in bag.messages(['/text'])] == ['hello']
-            assert [item.topic for item in bag.messages()] == ['/text']
-            assert 'could not be decoded' in bag.problems[1]
+
+def custom(path, gone=''):
+    """A recording by sqlite3 of /custom of a type nobody knows, and /text; gone: which definitions
+    it lacks, in SQL."""
+    store, text = get_typestore(Stores.ROS2_JAZZY), 'std_msgs/msg/String'
+    store.register(get_types_from_msg('float64 value', CUSTOM))
+    known = ('/custom', CUSTOM, {'value': 2.5}), ('/text', text, {'data': 'hello'})
+    with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        for log_ns, (topic, kind, values) in enumerate(known, start=1):
+            link = writer.add_connection(topic, kind, typestore=store)
+            writer.write(link, log_ns, store.serialize_cdr(store.types[kind](**values), kind))
+    if gone:
+        with contextlib.closing(sqlite3.connect(storage_file(path))) as database, database:
+            database.execute(f'delete from message_definitions where topic_type {gone}')
+    return path
+
+
+def test_a_type_defined_in_the_bag_is_read_and_a_known_one_needs_no_definition(tmp_path):
+    """Where none is in the bag, and where only those of other types are."""
+    both = ['/custom', '/text']
+    for gone, topics in (('', both), ("like '%'", both[1:]), ("like 'std_msgs%'", both)):
+        items, problems = read(custom(tmp_path / f'bag{len(gone)}', gone))
+        assert [item.topic for item in items] == topics
+        if topics == both:
+            assert items[0].message.value == 2.5 and not problems
+        else:
+            assert CUSTOM in problems[0]
+    # An undefined type is told and the rest is read.
+    with BagReader(custom(tmp_path / 'bag', f"= '{CUSTOM}'")) as bag:
+        known = [(topic.name, topic.decodable) for topic in bag.topics]
+        assert known == [('/custom', False), ('/text', True)]
+        assert CUSTOM in bag.problems[0]
+        assert [item.message.data for item in bag.messages(['/text'])] == ['hello']
+        assert [item.topic for item in bag.messages()] == ['/text']
+        assert 'could not be decoded' in bag.problems[1]
 
 
 COUNT, NAME = (TOPICS, 0, 'message_count'), (TOPICS, 0, 'topic_metadata', 'name')

@@ -20,8 +20,8 @@ import pytest
 from msg_adapters.estimates import read_estimate
 from sonar_imm.measurements import Fix
 from sonar_imm.truth import Received, Scene, TrueReflectors, TrueTrack, TruthTable
-from sonar_imm_tools.recordings import csv_writer
-from sonar_imm_tools.recordings.csv_writer import CsvWriter, FEW_ROWS, ROWS_IN_A_BLOCK
+from sonar_imm_tools.recordings import export
+from sonar_imm_tools.recordings.export import CsvWriter, FEW_ROWS, ROWS_IN_A_BLOCK
 from sonar_imm_tools.recordings.messages import cdr_of, decode_cdr, ros_message, typestore
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
@@ -59,12 +59,9 @@ def test_a_compressed_bag_is_smaller_and_says_the_same(write_fixes):
     assert plain == packed and len(plain) == 200
     sizes = [(path / f'{path.name}.mcap').stat().st_size for path in paths]
     assert sizes[1] < 0.6 * sizes[0]
-
-
-def test_the_metadata_are_of_version_8_with_the_offered_qos(write_fixes):
-    path = write_fixes(1)
-    assert 'version: 8' in (path / 'metadata.yaml').read_text()
-    with BagReader(path) as bag:
+    # Metadata are of version 8 with the offered QoS.
+    assert 'version: 8' in (paths[0] / 'metadata.yaml').read_text()
+    with BagReader(paths[0]) as bag:
         (profile,) = bag.topics[0].offered_qos
         assert profile.reliability.name == 'RELIABLE' and profile.depth == 10
 
@@ -164,22 +161,22 @@ def test_numbers_have_the_digits_of_python(name):
     assert written([column, column[::-1]]) == plain([column, column[::-1]])
 
 
-@pytest.mark.parametrize('rows', [0, 1, FEW_ROWS - 1, ROWS_IN_A_BLOCK, ROWS_IN_A_BLOCK + 1])
-def test_blocks_follow_one_another(rows):
-    columns = [np.arange(rows), SPREAD[:rows]]
-    assert written(columns) == plain(columns)
+def test_blocks_follow_one_another():
+    for rows in (0, 1, FEW_ROWS - 1, ROWS_IN_A_BLOCK, ROWS_IN_A_BLOCK + 1):
+        columns = [np.arange(rows), SPREAD[:rows]]
+        assert written(columns) == plain(columns)
 
 
 @pytest.fixture
 def choose_again():
-    csv_writer._arrow.cache_clear()
+    export._arrow.cache_clear()
     yield
-    csv_writer._arrow.cache_clear()
+    export._arrow.cache_clear()
 
 
 def test_pyarrow_writes_them_where_it_is_there():
     pytest.importorskip('pyarrow')
-    assert csv_writer._arrow() is not None
+    assert export._arrow() is not None
 
 
 @pytest.mark.parametrize('digits', ['none', 'others'])
@@ -189,8 +186,8 @@ def test_the_same_bytes_without_pyarrow_or_one_of_other_digits(monkeypatch, choo
     else:
         pytest.importorskip('pyarrow')
         other = '_texts', lambda column, arrow: arrow.array(['1'] * len(column))
-        monkeypatch.setattr(csv_writer, *other)
-    assert csv_writer._arrow() is None
+        monkeypatch.setattr(export, *other)
+    assert export._arrow() is None
     assert written([SPREAD, SPREAD]) == plain([SPREAD, SPREAD])
 
 
@@ -232,7 +229,7 @@ def test_late_measurements_are_recorded_when_they_were_received(tmp_path):
     assert logged(tmp_path / 'bag') == wanted
 
 
-def test_a_true_track_is_a_table_at_each_stamp():
+def test_truth_is_a_table_at_each_stamp_and_reflectors_lie_below():
     places, speeds = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], [[0.1, 0.2], [np.nan, np.nan]]
     true = TrueTrack(9, np.array([5, 8]), np.array(places), np.array(speeds))
     first, second = records_of(true, 'map')
@@ -245,13 +242,10 @@ def test_a_true_track_is_a_table_at_each_stamp():
     assert truth.extras['py'].tolist() == [5.0] and truth.extras['track_id'].tolist() == [9]
     assert read_estimate(first[2]).extras['vx'].tolist() == [0.1]
     assert np.isnan(truth.extras['vx']).all()
-
-
-def test_true_reflectors_lie_below_and_may_be_none():
-    true = TrueReflectors(5, 'array', np.array([3, 4]), np.array([10.0, 20.5]), np.ones(2))
-    (record,) = records_of(true, 'elsewhere')
-    truth = read_estimate(record[2])
-    assert truth.frame_id == 'array' and truth.xyz[:, 2].tolist() == [-10.0, -20.5]
-    assert truth.extras['depth'].tolist() == [10.0, 20.5]
-    nothing = TrueReflectors(5, 'array', np.empty(0, int), np.empty(0), np.empty(0))
-    assert len(read_estimate(records_of(nothing, '')[0][2])) == 0
+    for depth in ([10.0, 20.5], []):
+        number = np.arange(3, 3 + len(depth))
+        true = TrueReflectors(5, 'array', number, np.array(depth), np.ones(len(depth)))
+        (record,) = records_of(true, 'elsewhere')
+        truth = read_estimate(record[2])
+        assert truth.frame_id == 'array' and truth.extras['depth'].tolist() == depth
+        assert (truth.xyz[:, 2] == -np.array(depth)).all()

@@ -12,7 +12,7 @@ elsewhere; traces also as CSV.
 The arrays of snapshots are found by their usual names (`NAMES`); other names can be given. Needed
 are the complex samples, (bins, staves) for one ping or (pings, bins, staves), and the range or the
 two-way time of each bin. Where the archive also has the true floor, with the height and tilt of
-the sonar, it goes to ``/truth/estimate``.
+the sonar, it goes to ``/truth/estimate``. Both kinds of archive are opened and dated alike.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 import math
 from pathlib import Path
+from typing import Any
 import zipfile
 import zlib
 
@@ -35,10 +36,10 @@ from sonar_imm.truth import PRESENT, TrueProfile, TrueReflectors
 
 from ..conversion import ConversionReport, converter, Record, write_bag
 from ..convert_options import SnapshotsOptions, TracesOptions
-from ..csv_table import CsvTable
 from ..mcap_records import MAX_RATIO, MAX_UNPACKED, TOO_LARGE
 from ..messages import ros_message
 from ..sources import BagError
+from ..table_files import CsvTable
 from ..tables import Row
 from ..truth import records_of
 from .navigation import ARRAYS, Frame, navigation_of_arrays, navigation_of_table
@@ -82,7 +83,7 @@ EPOCH_UNITS = {
 """Parts of a second in which times since 1970 are counted, by the size of those until 2038."""
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
 Arrays = dict[str, NDArray]
-_CONSTANTS = ('sound_speed', 'frequency', 'sample_rate')
+_CONSTANTS = ('sound_speed', 'frequency', 'sample_rate', 'element_spacing')
 
 
 @converter(SnapshotsOptions)
@@ -93,7 +94,13 @@ def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionRepor
     times = content.get('stamp') if 'stamp' in how.names else content.times(len(samples))
     stamps = _stamps(content.path, times, len(samples), how.ping_rate, 'pings', report)
     constants = {name: content.number(name) for name in _CONSTANTS}
-    constants['element_spacing'] = _element_spacing(content, constants, report)
+    wavelengths = content.number('spacing_wavelengths')
+    if constants['element_spacing'] is None and wavelengths is not None:
+        speed, frequency = constants['sound_speed'], constants['frequency']
+        if speed and frequency:
+            constants['element_spacing'] = wavelengths * speed / frequency
+        else:  # for the parameters of the tracker
+            report.notes['element_spacing_wavelengths'] = f'{wavelengths:g}'
     poses = {name: array for name in ARRAYS if (array := content.get(name)) is not None}
     frame = Frame()
     records = navigation_of_table(how.nav, how.nav_options, report, on_earth=False, frame=frame)
@@ -106,9 +113,14 @@ def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionRepor
             records.append((stamp, '/snapshot', write_snapshot(snapshot, ros_message)))
         if snapshot and (profile := _true_floor(content, ping, snapshot)) is not None:
             records += records_of(profile, '')
-    report.note_ignored(path, content.unused)
+    _note_ignored(path, content.unused, report)
     own = {'bathymetry': frame.parameters()}
     write_bag(report, records, path, how, own, needed='/snapshot')
+
+
+def _note_ignored(path: Path, arrays: Sequence[str], report: ConversionReport) -> None:
+    if arrays:
+        report.notes[f'ignored arrays of {path.name}'] = ', '.join(arrays)
 
 
 class _Archive:
@@ -121,10 +133,10 @@ class _Archive:
         if unknown := [name for name in names if name not in NAMES]:
             raise BagError(f"unknown array '{unknown[0]}'; the names are {', '.join(NAMES)}")
         there = read_npz(self.path)
-        wanted = {what: (names[what],) if what in names else NAMES[what] for what in NAMES}
         self._arrays: dict[str, NDArray] = {}
         taken: set[str] = set()
-        for what, candidates in wanted.items():
+        for what, usually in NAMES.items():
+            candidates = (names[what],) if what in names else usually
             found = [name for name in candidates if name in there]
             found += [name for name in there if len(name) > 1 and name.lower() in candidates]
             taken |= set(found)
@@ -159,11 +171,9 @@ class _Archive:
     def number(self, what: str) -> float | None:
         """Give a scalar; None when the archive has none."""
         value = self.get(what)
-        if value is None:
-            return None
-        if value.size != 1 or not np.isfinite(value).all():
+        if value is not None and (value.size != 1 or not np.isfinite(value).all()):
             raise BagError(f'{self.path}: {what} has to be one finite number')
-        return float(value.ravel()[0])
+        return None if value is None else float(value.ravel()[0])
 
     def per_bin(self, what: str, ping: int, bins: int) -> NDArray | None:
         """Give the row (bins,) of a ping, from one number, (bins,) or (pings, bins); None when the
@@ -196,28 +206,12 @@ def _samples(content: _Archive, staves: Sequence[Sequence[int]] | None) -> NDArr
     return np.stack([iq[:, :, list(stave)].sum(axis=2) for stave in staves], axis=2)
 
 
-def _element_spacing(
-    content: _Archive, constants: Mapping[str, float | None], report: ConversionReport
-) -> float | None:
-    """Metres between staves. A spacing in wavelengths that cannot be converted is noted instead,
-    for the parameters of the tracker."""
-    metres = content.number('element_spacing')
-    wavelengths = content.number('spacing_wavelengths')
-    if metres is not None or wavelengths is None:
-        return metres
-    speed, frequency = constants['sound_speed'], constants['frequency']
-    if speed and frequency:
-        return wavelengths * speed / frequency
-    report.notes['element_spacing_wavelengths'] = f'{wavelengths:g}'
-    return None
-
-
 def _snapshot(
     content: _Archive,
     ping: int,
     stamp: int,
     iq: NDArray,
-    constants: Mapping[str, float | None],
+    constants: Mapping[str, Any],
     frame_id: str,
 ) -> Snapshot:
     bins = len(iq)
@@ -227,9 +221,9 @@ def _snapshot(
         time = content.per_bin('time', ping, bins)
         assert time is not None
         ranges = np.asarray(0.5 * (constants['sound_speed'] or 1500.0) * time)
-    noise = content.per_bin('noise_variance', ping, bins)
-    signal = content.per_bin('signal_variance', ping, bins)
-    ratio = content.per_bin('snr', ping, bins)
+    noise, signal, ratio = (
+        content.per_bin(name, ping, bins) for name in ('noise_variance', 'signal_variance', 'snr')
+    )
     if signal is None and ratio is not None and noise is not None:
         signal = ratio * noise
     return Snapshot(
@@ -240,10 +234,7 @@ def _snapshot(
         two_way_time=time,
         noise_variance=noise,
         signal_variance=signal,
-        sound_speed=constants['sound_speed'],
-        frequency=constants['frequency'],
-        element_spacing=constants['element_spacing'],
-        sample_rate=constants['sample_rate'],
+        **constants,
     )
 
 
@@ -289,7 +280,8 @@ def _from_archive(
     report: ConversionReport, path: Path, rate: float, frame_id: str
 ) -> list[Record]:
     arrays = read_npz(path)
-    report.note_ignored(path, [name for name in arrays if name not in {*TRACE_NAMES, 'stamp'}])
+    ignored = [name for name in arrays if name not in {*TRACE_NAMES, 'stamp'}]
+    _note_ignored(path, ignored, report)
     for name in arrays.keys() & TRACE_NAMES:
         numbers_of(path, name, arrays[name])
     for name in ('depth', 'amplitude'):
@@ -303,38 +295,29 @@ def _from_archive(
             ' (n,) and (traces, n) are needed'
         )
     stamps = _stamps(path, arrays.get('stamp'), T, rate, 'traces', report)
-    sigma = _rows(arrays, path, 'sigma', amplitude.shape)
-    reference = _rows(arrays, path, 'reference_depth', (T,))
+    shapes = (('sigma', amplitude.shape), ('reference_depth', (T,)))
+    given = {'amplitude': amplitude} | {
+        name: _rows(path, name, arrays[name], shape) for name, shape in shapes if name in arrays
+    }
     records: list[Record] = []
     for k, stamp in enumerate(stamps):
         report.rows += 1
         with report.leaving_out(path, f'trace {k}'):
-            trace = Trace(
-                stamp_ns=stamp,
-                frame_id=frame_id,
-                depth=depth,
-                amplitude=amplitude[k],
-                sigma=None if sigma is None else sigma[k],
-                reference_depth=None if reference is None else reference[k],
-            )
+            own = {name: array[k] for name, array in given.items()}
+            trace = Trace(stamp_ns=stamp, frame_id=frame_id, depth=depth, **own)
             records.append((stamp, '/trace', write_trace(trace, ros_message)))
     return records + _true_reflectors(arrays, path, stamps, frame_id)
 
 
-def _rows(arrays: Arrays, path: Path, name: str, shape: tuple[int, ...]) -> NDArray | None:
-    """The array `name` broadcast to `shape`, from one number, one per trace or all of them; None
-    when there is none."""
-    value = arrays.get(name)
-    if value is None:
-        return None
+def _rows(path: Path, name: str, value: NDArray, shape: tuple[int, ...]) -> NDArray:
+    """The array `name` broadcast to `shape`, from one number, one per trace or all of them."""
     if value.ndim == 1 and len(shape) == 2 and len(value) == shape[0]:
         value = value[:, None]
     try:
         return np.broadcast_to(value, shape)
     except ValueError:
-        raise BagError(
-            f'{path}: {name} has the shape {value.shape} for {shape[0]} traces'
-        ) from None
+        sentence = f'{path}: {name} has the shape {value.shape} for {shape[0]} traces'
+        raise BagError(sentence) from None
 
 
 def _true_reflectors(arrays: Arrays, path: Path, stamps: list[int], frame_id: str) -> list[Record]:
@@ -371,8 +354,8 @@ def _from_table(report: ConversionReport, table: CsvTable, frame_id: str) -> lis
     rows = report.read_rows(table, parse)
     for stamp, group in groupby(rows, key=lambda pair: pair[1][0]):
         lines = list(group)
-        depth, amplitude, sigma = np.array([sample[1:] for _, sample in lines]).T
-        given = {'depth': depth, 'amplitude': amplitude, 'sigma': sigma}
+        samples = np.array([sample[1:] for _, sample in lines]).T
+        given = dict(zip(('depth', 'amplitude', 'sigma'), samples))
         with report.leaving_out(table.path, f'trace from line {lines[0][0].line}'):
             trace = Trace(stamp_ns=stamp, frame_id=frame_id, **given)
             records.append((stamp, '/trace', write_trace(trace, ros_message)))

@@ -39,18 +39,16 @@ from sonar_imm.measurements import Arrivals
 from ..columns import LOTEK, name_of, THELMA
 from ..conversion import ConversionReport, converter, flags_of, Record, write_bag
 from ..convert_options import ArrivalsOptions, DetectionsOptions
-from ..csv_table import CsvTable
 from ..messages import ros_message
 from ..places import LocalFrame, origin_parameters
 from ..sources import BagError
+from ..table_files import CsvTable
 from ..tables import CsvOptions, Row, Table
 from ..times import BadRow
 from ..truth import number_names, truth_records
 
 _NOWHERE = (math.nan, math.nan, math.nan)
 Places = Mapping[str, tuple[float, float, float]]
-
-
 OPTIONAL = (
     'var_toa', 'bearing', 'var_bearing', 'elevation', 'var_elevation', 'depth', 'var_depth',
 )  # fmt: skip
@@ -75,28 +73,32 @@ def convert_arrivals(path: Path, how: ArrivalsOptions, report: ConversionReport)
     places, origin = read_places(
         how.receivers, report, how.receiver_options, how.origin, 'receiver'
     )
-    senders = (
-        places
-        if how.transmitters is None
-        else read_places(how.transmitters, report, how.receiver_options, origin, 'transmitter')[0]
-    )
+    senders: Places | None = places
+    if how.transmitters is not None:
+        files = how.transmitters, report, how.receiver_options
+        senders = read_places(*files, origin, 'transmitter')[0]
     default = math.nan if how.toa_std is None else how.toa_std**2
     pings: dict[tuple[object, str], list[Arrival]] = {}
     table = CsvTable(path, how.options)
-    passive = _is_passive(table)
-    rows = report.read_rows(table, lambda row: _parse(row, passive, places, senders, default))
+    table.require('receiver')
+    if table.has('toa', 'transmitter'):
+        table.require('stamp')
+    else:
+        table.require('ping', 'arrival')
+        senders = None
+    rows = report.read_rows(table, lambda row: _parse(row, places, senders, default))
     for _, arrival in rows:
         key = (arrival.ping if table.has('ping') else arrival.time_ns, arrival.tag)
         pings.setdefault(key, []).append(arrival)
-    stations = Stations(places, senders, origin)
-    write_pings(table, pings, stations, passive, report, how)
+    write_pings(table, pings, Stations(places, senders, origin), report, how)
 
 
 class Stations(NamedTuple):
-    """Positions of receivers and transmitters by name, and the origin of their local metres."""
+    """Positions of receivers and transmitters by name, and the origin of their local metres.
+    transmitters: None where nobody knows when a ping was emitted."""
 
     receivers: Places
-    transmitters: Places
+    transmitters: Places | None
     origin: tuple[float, ...] | None
 
 
@@ -104,63 +106,59 @@ def write_pings(
     table: Table,
     pings: Mapping[tuple[object, str], list[Arrival]],
     stations: Stations,
-    passive: bool,
     report: ConversionReport,
     how: ArrivalsOptions | DetectionsOptions,
 ) -> None:
-    """Write one message for each ping, by its name and its tag. passive: nobody knows when a ping
-    was emitted. Raises `BagError`."""
+    """Write one message for each ping, by its name and its tag. Raises `BagError`."""
     places, senders, origin = stations
-    tags = _tag_numbers([arrival.tag for ping in pings.values() for arrival in ping], report)
+    heard = (arrival.tag for ping in pings.values() for arrival in ping)
+    tags = number_names([tag for tag in heard if tag])  # as ``tx_id`` has them
+    report.target_names = tags
+    if any(str(number) != name for name, number in tags.items()):
+        report.notes['tag'] = ', '.join(f'{name} is {number}' for name, number in tags.items())
     numbers = number_names(list(places))
-    sender_numbers = tags
-    if not passive:
-        sender_numbers = numbers if senders is places else number_names(list(senders))
+    sender_numbers = number_names(list(senders or ()))
     records: list[Record] = []
     streams: dict[str, list[int]] = {}
     for label, ping in pings.items():
         with report.leaving_out(table.path, f'ping {label[0]}'):
-            measurement = _of_ping(
-                ping, passive, places, senders, numbers, sender_numbers, how.frame_id
+            stamp = min(arrival.time_ns for arrival in ping)
+            late = [(arrival.time_ns - stamp) * 1e-9 for arrival in ping]
+            if senders is None:
+                toa, tx = late, [_NOWHERE for _ in ping]
+                tx_id = [tags.get(arrival.tag, 0) for arrival in ping]
+            else:
+                toa = [arrival.toa + more for arrival, more in zip(ping, late)]
+                tx = [senders[arrival.transmitter] for arrival in ping]
+                tx_id = [sender_numbers[arrival.transmitter] for arrival in ping]
+            measurement = Arrivals(
+                stamp_ns=stamp,
+                frame_id=how.frame_id,
+                toa=toa,
+                tx_id=tx_id,
+                rx_id=[numbers[arrival.receiver] for arrival in ping],
+                tx=np.array(tx),
+                rx=np.array([places[arrival.receiver] for arrival in ping]),
+                **dict(zip(OPTIONAL, zip(*(arrival.optional for arrival in ping)))),
             )
-            stamp = measurement.stamp_ns
             records.append((stamp, '/arrivals', write_arrivals(measurement, ros_message)))
             streams.setdefault(label[1], []).append(stamp)
-    if how.truth is not None and records:
-        records += truth_records(how.truth, report, how.truth_options, how.frame_id, origin)
+    if records:
+        records += truth_records(how, report, origin)
     if any(name != str(number) for name, number in numbers.items()):
         report.notes['receivers'] = ', '.join(f'{name} = {numbers[name]}' for name in numbers)
-    if passive:
+    if senders is None:
         report.notes['emission'] = 'unknown; the stamp is the earliest arrival of the ping'
     write_bag(report, records, table.path, how, {'diver': origin_parameters(origin)}, streams)
 
 
-def _tag_numbers(names: list[str], report: ConversionReport) -> dict[str, int]:
-    """The number of each tag, as ``tx_id`` has it: its own, or its order from 1."""
-    numbers = number_names([name for name in names if name])
-    report.target_names = numbers
-    if any(str(number) != name for name, number in numbers.items()):
-        report.notes['tag'] = ', '.join(f'{name} is {number}' for name, number in numbers.items())
-    return numbers
-
-
-def _is_passive(table: CsvTable) -> bool:
-    """Tell the two kinds of file apart by their columns."""
-    table.require('receiver')
-    if table.has('toa', 'transmitter'):
-        table.require('stamp')
-        return False
-    table.require('ping', 'arrival')
-    return True
-
-
-def _parse(row: Row, passive: bool, places: Places, senders: Places, default: float) -> Arrival:
-    """Read one line of the arrivals."""
+def _parse(row: Row, places: Places, senders: Places | None, default: float) -> Arrival:
     row.require_valid()
+    passive = senders is None
     receiver, transmitter = row.text('receiver'), '' if passive else row.text('transmitter')
     if receiver not in places:
         raise BadRow(f"the position of receiver '{receiver}' is not known")
-    if not passive and transmitter not in senders:
+    if senders is not None and transmitter not in senders:
         raise BadRow(f"the position of transmitter '{transmitter}' is not known")
     ping = row.text('ping')
     if passive and not ping:
@@ -197,36 +195,6 @@ def _variance(row: Row, what: str) -> float:
         return row.optional(f'var_{what}')
     std = row.optional(f'std_{what}')
     return std * std
-
-
-def _of_ping(
-    ping: list[Arrival],
-    passive: bool,
-    places: Places,
-    senders: Places,
-    numbers: Mapping[str, int],
-    sender_numbers: Mapping[str, int],
-    frame_id: str,
-) -> Arrivals:
-    """Put the lines of one ping together."""
-    stamp = min(arrival.time_ns for arrival in ping)
-    if passive:
-        toa = [(arrival.time_ns - stamp) * 1e-9 for arrival in ping]
-    else:
-        toa = [arrival.toa + (arrival.time_ns - stamp) * 1e-9 for arrival in ping]
-    return Arrivals(
-        stamp_ns=stamp,
-        frame_id=frame_id,
-        toa=toa,
-        tx_id=[
-            sender_numbers.get(arrival.tag, 0) if passive else sender_numbers[arrival.transmitter]
-            for arrival in ping
-        ],
-        rx_id=[numbers[arrival.receiver] for arrival in ping],
-        tx=np.array([_NOWHERE if passive else senders[arrival.transmitter] for arrival in ping]),
-        rx=np.array([places[arrival.receiver] for arrival in ping]),
-        **dict(zip(OPTIONAL, zip(*(arrival.optional for arrival in ping)))),
-    )
 
 
 def read_places(

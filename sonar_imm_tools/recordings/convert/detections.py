@@ -36,8 +36,8 @@ from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 from ... import SECOND
 from ..conversion import ConversionReport, converter
 from ..convert_options import DetectionsOptions
-from ..csv_table import CsvTable
 from ..sources import BagError
+from ..table_files import CsvTable
 from ..tables import Row
 from ..times import BadRow
 from .arrivals import Arrival, name_columns, Places, read_places, Stations, write_pings
@@ -113,13 +113,12 @@ def convert_detections(path: Path, how: DetectionsOptions, report: ConversionRep
     rows = [parsed for _, parsed in report.read_rows(table, parse)]
     tags = list(dict.fromkeys(tag for _, tag, _ in rows))
     number = {tag: k for k, tag in enumerate(tags)}
-    received = Received(
-        np.array([receiver for receiver, _, _ in rows], np.int64),
-        np.array([number[tag] for _, tag, _ in rows], np.int64),
-        np.array([stamp for _, _, stamp in rows], np.int64),
-    )
+    found = [(receiver, number[tag], stamp) for receiver, tag, stamp in rows]
+    received = Received(*np.array(found, np.int64).reshape(-1, 3).T)
     stamps, known, std = received.stamp_ns, np.ones(len(rows), bool), how.toa_std
-    size = _size(np.array(list(places.values()))) / how.sound_speed
+    stations = np.array(list(places.values()))
+    apart = np.linalg.norm(stations[:, None] - stations[None], axis=-1)
+    size = float(apart.max(initial=0.0)) / how.sound_speed
     rounding = _rounding(table, received.stamp_ns, size, how, report)
     if len(names) > 1 and len(set(received.receiver.tolist())) == 1:
         report.questions.append(
@@ -128,13 +127,8 @@ def convert_detections(path: Path, how: DetectionsOptions, report: ConversionRep
         )
     if fixed:
         at = np.array([fixed.get(tag, (np.nan,) * 3) for tag in tags]).reshape(-1, 3)
-        clocks = compare_clocks(
-            received,
-            np.array(list(places.values())),
-            at,
-            how.sound_speed,
-            how.clock_interval * HOUR,
-        )
+        interval = how.clock_interval * HOUR
+        clocks = compare_clocks(received, stations, at, how.sound_speed, interval)
         stamps, known = clocks.right(received)
         std = std or (None if np.isnan(clocks.std) else max(clocks.std, rounding or LEAST))
         _note(report, clocks, names)
@@ -158,7 +152,7 @@ def convert_detections(path: Path, how: DetectionsOptions, report: ConversionRep
             ]
     if not pings and fixed:
         report.problems.append('there is no tag beside the fixed ones')
-    write_pings(table, pings, Stations(places, places, origin), True, report, how)
+    write_pings(table, pings, Stations(places, None, origin), report, how)
 
 
 def _note(report: ConversionReport, clocks: Clocks, names: Sequence[str]) -> None:
@@ -179,11 +173,12 @@ def _note(report: ConversionReport, clocks: Clocks, names: Sequence[str]) -> Non
 def _receiver(row: Row, known: Mapping[str, int]) -> str:
     """The name of the receiver: that of the row, also behind its model or with one left out."""
     text = row.text('receiver')
-    named = [text] if text in known else []
-    named = named or [f'{row.text("model")}-{text}'] if row.text('model') else named
-    found = [name for name in named if name in known] or [
-        name for name in known if text and name.endswith(f'-{text}')
-    ]
+    named = text if text in known else f'{row.text("model")}-{text}'
+    found = (
+        [named]
+        if named in known and (named == text or row.text('model'))
+        else [name for name in known if text and name.endswith(f'-{text}')]
+    )
     if len(found) != 1:
         raise BadRow(f"the position of receiver '{text}' is not known", 'unknown receiver')
     return found[0]
@@ -195,11 +190,6 @@ def _tag(row: Row) -> str:
     if not text:
         raise BadRow('the tag is empty')
     return text if not space or text.startswith(space) else f'{space}-{text}'
-
-
-def _size(places: FloatArray) -> float:
-    """The longest distance between places (n, 3)."""
-    return float(np.linalg.norm(places[:, None] - places[None], axis=-1).max(initial=0.0))
 
 
 def _rounding(
@@ -290,11 +280,11 @@ def compare_clocks(
     """
     begin_ns = int(received.stamp_ns.min()) if len(received.stamp_ns) else 0
     seconds = (received.stamp_ns - begin_ns) / SECOND
-    spans = max(1, int(np.ceil(seconds.max(initial=0.0) / interval)))
-    knots = np.linspace(0.0, max(seconds.max(initial=0.0), 1.0), spans + 1)
+    end = seconds.max(initial=0.0)
+    knots = np.linspace(0.0, max(end, 1.0), max(1, int(np.ceil(end / interval))) + 1)
     groups, reduced = _sync_groups(received, seconds, receivers, tags, sound_speed)
-    nothing = np.full((len(receivers), len(knots)), np.nan)
     if not groups:
+        nothing = np.full((len(receivers), len(knots)), np.nan)
         return Clocks(begin_ns, knots, nothing, np.nan, 0)
     row = np.concatenate(groups)
     ping = np.repeat(np.arange(len(groups)), [len(group) for group in groups])

@@ -6,39 +6,60 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""CSV tables of position fixes."""
+"""Tables of position fixes, on their own or relative to a vessel whose pose stands in the same
+row. Both kinds of table are read, checked and grouped alike, and therefore stand here."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-import itertools
+from collections.abc import Callable, Iterable, Sequence
 import math
 from pathlib import Path
+import re
+from typing import Any, NamedTuple
 
+from attrs import evolve
 import numpy as np
 
-from msg_adapters.fixes import check_size, write_fix
+from msg_adapters.arrivals import FARTHEST
+from msg_adapters.fixes import check_size, write_fix, write_geodetic, write_relative
+from msg_adapters.inputs.topic import tag_numbers
+from msg_adapters.navigation import write_heading, write_navigation
 from msg_adapters.scans import write_scan
 from sonar_imm.intake import RepeatFilter
-from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
+from sonar_imm.measurements import (
+    Fix,
+    Fixes,
+    NOBODY,
+    Rejection,
+    RelativeFix,
+    VesselFix,
+    VesselHeading,
+    VesselPose,
+)
 
 from ... import SECOND
 from ..columns import is_of_vessel, name_of, rank_of, UNRELATED
-from ..conversion import ask_for_units, ConversionReport, converter, Record, write_bag
-from ..convert_options import FixesOptions
+from ..conversion import ask_for_units, ConversionReport, converter, Leaps, Record, write_bag
+from ..convert_options import FixesOptions, RelativeOptions
 from ..messages import ros_message
-from ..places import bearings_from, LocalFrame, origin_parameters, PolarRows
+from ..places import (
+    ask_for_angle,
+    bearings_from,
+    checked_origin,
+    Degrees,
+    LocalFrame,
+    origin_parameters,
+    PolarRows,
+)
 from ..sources import BagError, quoted
+from ..table_files import CsvTable, open_table
 from ..tables import Row, Table
 from ..times import BadRow
-from ..track_files import open_table
 from ..truth import number_names, truth_records
 
 REPEAT_TIME = 5.0
 """Seconds within which the same position is a repeated poll: the default of the tracker."""
-
-
 _UNITS = (
     ('whole hours', 3600 * SECOND),
     ('whole minutes', 60 * SECOND),
@@ -80,22 +101,12 @@ def write_fixes(
             _ask_for_vessel(table)
         bearings = bearings_from(table, how.bearings, 'north')
         polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg, how.ranges)
-    elif table.has('range', 'bearing') and _may_be_of_vessel(table):
-        names = ('x', 'y') if table.has('x', 'y') else ('latitude', 'longitude')
-        headers = [table.header(name) for name in names]
-        columns = ' '.join(f"--column 'vessel_{n}={h}'" for n, h in zip(names, headers))
-        raise BagError(
-            f'{table.path}: {" and ".join(headers)} may be the position of the target, or that of '
-            f'a vessel from which {table.header("range")} and {table.header("bearing")} are '
-            f'measured. Of the target: --ignore range. Of a vessel: sonar-imm convert relative '
-            f'{quoted(table.path)} OUT_BAG {columns}'
-        )
+    elif table.has('range', 'bearing'):
+        _ask_for_target(table)
     frame = None if polar else LocalFrame(table, how.origin)
     origin = frame.origin if frame else None
-    place = ('range', 'bearing') if polar else ('x', 'y')
-    if frame and frame.geodetic:
-        place = ('latitude', 'longitude')
-
+    place = ('latitude', 'longitude') if frame and frame.geodetic else ('x', 'y')
+    place = ('range', 'bearing') if polar else place
     repeats: dict[str, RepeatFilter] = {}
     repeated: list[int] = []
 
@@ -106,12 +117,12 @@ def write_fixes(
             if name:
                 raise BadRow(f'{name} has no position')
             return stamp_ns, None, name
-        if frame:
-            position, covariance = frame.position(row), _covariance(row)
-        else:
-            assert polar is not None
+        if polar:
             flat, covariance = polar.place(row)
             position = (*flat.tolist(), row.height())
+        else:
+            assert frame is not None
+            position, covariance = frame.position(row), _covariance(row)
         fix = Fix(
             stamp_ns=stamp_ns,
             position=position,
@@ -131,9 +142,8 @@ def write_fixes(
     if polar:
         polar.check_unit()
     fixes = [fix for _, fix, _ in rows]
-    ask_for_units(
-        [fix.stamp_ns for fix in fixes], [fix.position[:2] for fix in fixes], table.path, report
-    )
+    stamps = [fix.stamp_ns for fix in fixes]
+    ask_for_units(stamps, [fix.position[:2] for fix in fixes], table.path, report)
     if not rows:
         for line, _ in empty:
             report.bad_row(table.path, f'line {line}', f'{" and ".join(place)} are empty')
@@ -147,33 +157,34 @@ def write_fixes(
                 else f'{table.header(depth)} is not tracked, since no column is its standard '
                 'deviation; say --depth-std METRES'
             )
-    named = _names_divers(table, rows, report)
-    records: Iterable[Record]
+    names = [name for _, _, name in rows if name]
+    named = bool(names)
+    if len(names) > 1 and 2 * len(set(names)) > len(names):  # it numbers the rows
+        report.notes['id'] = f'{table.header("id")} changes from row to row and names no diver'
+        named = False
     if named or empty:
-        stamps = [stamp for _, stamp in empty]
-        records = _scans(rows, stamps, named, table.path, report, how.frame_id)
+        records = _scans(rows, [stamp for _, stamp in empty], named, table.path, report, how)
     else:
-        records = ((fix.stamp_ns, '/fix', write_fix(fix, ros_message)) for fix in fixes)
+        records = [(fix.stamp_ns, '/fix', write_fix(fix, ros_message)) for fix in fixes]
     if frame:
         origin = frame.origin
         report.notes.update(frame.notes())
-    truth: list[Record] = []
-    if how.truth is not None and rows:
-        truth = truth_records(how.truth, report, how.truth_options, how.frame_id, origin)
+    if rows:
+        records += truth_records(how, report, origin)
     if empty:
         report.notes['empty scans'] = (
             f'{len(empty)} rows have a time and no position, the first in line '
             f'{empty[0][0]}: nobody was seen then'
         )
-    if not named and (shared := _shared([fix.stamp_ns for fix in fixes])):
+    if not named and (shared := _shared(stamps)):
         report.notes['shared stamps'] = shared
     if repeated:
         report.notes['repeated'] = (
             f'{len(repeated)} rows hold a position that came before, the first in line '
             f'{repeated[0]}; the tracker leaves them out (repeat_time)'
         )
-    streams = by_name((name if named else '', stamp) for _, stamp, _, name in read)
-    every = itertools.chain(records, truth, beside) if rows else []
+    streams = _by_name((name if named else '', stamp) for _, stamp, _, name in read)
+    every = [*records, *beside] if rows else []
     write_bag(report, every, table.path, how, {'diver': origin_parameters(origin)}, streams)
 
 
@@ -204,7 +215,7 @@ _OF_RANGES = (
 """Quantities of a table of ranges and bearings from one place."""
 
 
-def by_name(stamps: Iterable[tuple[str, int]]) -> dict[str, list[int]]:
+def _by_name(stamps: Iterable[tuple[str, int]]) -> dict[str, list[int]]:
     """The stamps of each diver, in their order."""
     found: dict[str, list[int]] = {}
     for name, stamp_ns in stamps:
@@ -212,13 +223,23 @@ def by_name(stamps: Iterable[tuple[str, int]]) -> dict[str, list[int]]:
     return found
 
 
-def _may_be_of_vessel(table: Table) -> bool:
-    """Say whether positions beside range and bearing have neither a word for the target nor one of
-    a vessel beside them, nor were named by hand."""
+def _ask_for_target(table: Table) -> None:
+    """Raise `BagError` where positions beside range and bearing have neither a word for the target
+    nor one of a vessel beside them, nor were named by hand."""
     names = [name for name in ('x', 'y', 'latitude', 'longitude') if table.has(name)]
     vessel = any(table.has(name) for name in ('vessel_x', 'vessel_latitude'))
     ranks = [rank_of(name, table.header(name)) for name in names]
-    return not vessel and min(ranks) >= 0 and not set(names) & set(table.options.columns)
+    if vessel or min(ranks) < 0 or set(names) & set(table.options.columns):
+        return
+    names = ['x', 'y'] if table.has('x', 'y') else ['latitude', 'longitude']
+    headers = [table.header(name) for name in names]
+    columns = ' '.join(f"--column 'vessel_{n}={h}'" for n, h in zip(names, headers))
+    raise BagError(
+        f'{table.path}: {" and ".join(headers)} may be the position of the target, or that of '
+        f'a vessel from which {table.header("range")} and {table.header("bearing")} are '
+        f'measured. Of the target: --ignore range. Of a vessel: sonar-imm convert relative '
+        f'{quoted(table.path)} OUT_BAG {columns}'
+    )
 
 
 def _shared(stamps: Sequence[int]) -> str:
@@ -237,27 +258,13 @@ def _shared(stamps: Sequence[int]) -> str:
     )
 
 
-def _names_divers(
-    table: Table, rows: Sequence[tuple[int, Fix, str]], report: ConversionReport
-) -> bool:
-    """Whether the column ``id`` says whose the rows are. One that is another in most rows numbers
-    the rows."""
-    names = [name for _, _, name in rows if name]
-    if not names:
-        return False
-    if len(names) > 1 and 2 * len(set(names)) > len(names):
-        report.notes['id'] = f'{table.header("id")} changes from row to row and names no diver'
-        return False
-    return True
-
-
 def _scans(
     rows: Sequence[tuple[int, Fix, str]],
     empty: Sequence[int],
     named: bool,
     path: Path,
     report: ConversionReport,
-    frame_id: str,
+    how: FixesOptions,
 ) -> list[Record]:
     """Scans of the rows with the same stamp, each with the number of its diver where the rows are
     named, and those at the stamps `empty`, in which nobody was seen."""
@@ -273,26 +280,18 @@ def _scans(
             report.bad_row(path, f'line {line}', f'{name} is there at this time')
             continue
         scan.append((fix, number))
-    unknown = np.full((3, 3), np.nan)
-    return [
-        (
-            stamp_ns,
-            '/fixes',
-            write_scan(
-                Fixes(
-                    stamp_ns=stamp_ns,
-                    position=np.array([fix.position for fix, _ in scan]).reshape(-1, 3),
-                    covariance=np.array(
-                        [unknown if fix.covariance is None else fix.covariance for fix, _ in scan]
-                    ).reshape(-1, 3, 3),
-                    target_id=[number for _, number in scan] if named else None,
-                    frame_id=frame_id,
-                ),
-                ros_message,
-            ),
+    unknown, records = np.full((3, 3), np.nan), []
+    for stamp_ns, scan in by_stamp.items():
+        covariance = [unknown if fix.covariance is None else fix.covariance for fix, _ in scan]
+        fixes = Fixes(
+            stamp_ns=stamp_ns,
+            position=np.array([fix.position for fix, _ in scan]).reshape(-1, 3),
+            covariance=np.array(covariance).reshape(-1, 3, 3),
+            target_id=[number for _, number in scan] if named else None,
+            frame_id=how.frame_id,
         )
-        for stamp_ns, scan in by_stamp.items()
-    ]
+        records.append((stamp_ns, '/fixes', write_scan(fixes, ros_message)))
+    return records
 
 
 def _covariance(row: Row) -> np.ndarray | None:
@@ -306,11 +305,9 @@ def _covariance(row: Row) -> np.ndarray | None:
         var_x, cov_xy, var_y = std_x * std_x, 0.0, std_y * std_y
         if std_x < 0.0 or std_y < 0.0:
             return None
-    if math.isnan(var_x + var_y + cov_xy) or var_x < 0.0 or var_y < 0.0:
-        return None
-    if var_x == var_y == cov_xy == 0.0:
-        return None
-    return np.array([[var_x, cov_xy], [cov_xy, var_y]])
+    known = var_x >= 0.0 and var_y >= 0.0 and not math.isnan(cov_xy)
+    stated = known and not var_x == var_y == cov_xy == 0.0
+    return np.array([[var_x, cov_xy], [cov_xy, var_y]]) if stated else None
 
 
 def _with_height(
@@ -332,3 +329,156 @@ def _with_height(
             across = row.optional(name) if row.table.has(name) else 0.0
             whole[2, axis] = whole[axis, 2] = across
     return whole
+
+
+TRANSCEIVER = 'transceiver'
+"""Frame of a position that does not say whose it is."""
+
+
+class _Parsed(NamedTuple):
+    """A row: topic, writer and measurement of each part of the vessel's pose; the position, None
+    for an empty scan; whose it is."""
+
+    stamp_ns: int
+    pose: list[tuple[str, Callable[..., Any], Any]]
+    fix: RelativeFix | None
+    name: str
+
+
+@converter(RelativeOptions)
+def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport) -> None:
+    """Convert a CSV of positions relative to a vessel to ``/relative``, in a frame of the name
+    where ``id`` says whose they are, and the vessel to ``/nav``, or ``/nav_fix`` and ``/heading``.
+
+    Columns and values: as in `RelativeOptions`. The tracker composes them as it does live; what it
+    has to know (``tags``, ``relative_axes``, the origin) is in ``parameters.yaml`` beside the bag.
+    Rows with the same stamp share the pose of the first of them. Raises `BagError`.
+    """
+    table = CsvTable(path, how.options)
+    table.require('stamp')
+    geodetic = table.has('vessel_latitude', 'vessel_longitude')
+    if not geodetic:
+        table.require('vessel_x', 'vessel_y')
+    degrees = Degrees(table, 'vessel_') if geodetic else None
+    polar = None
+    if not table.has('forward', 'starboard'):
+        across = table.has('forward') or table.has('starboard')
+        table.require(*(('forward', 'starboard') if across else ('range', 'bearing')))
+        bearings = bearings_from(table, how.bearings, 'bow')
+        polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg, how.ranges)
+    levelled = polar is not None and bearings != 'bow'
+    if not levelled and not table.has('heading'):
+        left = [
+            header
+            for k, header in enumerate(table.headers)
+            if k not in table.index.values() and table.first_numbers(k, 1.0)
+        ]
+        raise BagError(
+            f'{table.path} has no column for heading, and bearings count from the bow; not used '
+            f'are {", ".join(left) or "no columns of numbers"}. If one of them is the heading: '
+            f"--column 'heading={left[0] if left else 'HEADER'}'. If bearings count from north: "
+            '--bearings north'
+        )
+    place = ('range', 'bearing') if polar else ('forward', 'starboard')
+    headings: list[float] = []
+
+    def parse(row: Row) -> _Parsed:
+        row.require_valid()
+        headings.append(row.optional('heading'))
+        stamp_ns, name = row.stamp_ns(), row.text('id')
+        pose = _pose(row, stamp_ns, degrees, levelled, how.frame_id)
+        if row.empty(*place):
+            if name:
+                raise BadRow(f'{name} has no position')
+            return _Parsed(stamp_ns, pose, None, name)
+        if polar:
+            flat, covariance = polar.place(row)
+        else:
+            flat, covariance = np.array([row.number('forward'), -row.number('starboard')]), None
+        std = row.optional('std')
+        if covariance is None and std > 0.0:
+            covariance = std**2 * np.eye(2)
+        offset, whole = np.append(flat, row.height()), None
+        if covariance is not None:  # up it is as uncertain as in the worst direction of the plane
+            whole = np.zeros((3, 3))
+            whole[:2, :2], whole[2, 2] = covariance, np.linalg.eigvalsh(covariance)[1]
+        fix = RelativeFix(stamp_ns=stamp_ns, offset=offset, covariance=whole)
+        return _Parsed(stamp_ns, pose, fix, name)
+
+    rows = [parsed for _, parsed in report.read_rows(table, parse)]
+    if polar:
+        polar.check_unit()
+    if not levelled:
+        ask_for_angle(table, 'heading', headings)
+    leaps, origin = Leaps(), checked_origin(how.origin)
+    if geodetic:
+        leaps.saw_all(row.pose[0][2] for row in rows)
+    else:
+        origin = None
+        for row in rows:
+            leaps.saw(row.stamp_ns, *row.pose[0][2].position[:2].tolist())
+    leaps.tell(table.path, report)
+    tags = {row.name: re.sub(r'[^A-Za-z0-9_]+', '_', row.name) for row in rows if row.name}
+    if geodetic and rows and origin is None:
+        first: VesselFix = rows[0].pose[0][2]
+        origin = (first.latitude, first.longitude, 0.0)
+    if origin is not None:
+        report.notes['origin'] = 'latitude {!r}, longitude {!r}, height {!r}'.format(*origin)
+    records: list[Record] = []
+    if any(row.fix is not None for row in rows):
+        # Poses go before what is measured from them, one for each stamp, the first.
+        records = [
+            (stamp_ns, topic, write(measurement, ros_message))
+            for stamp_ns, pose in {row.stamp_ns: row.pose for row in reversed(rows)}.items()
+            for topic, write, measurement in pose
+        ]
+        records += [_target(row, tags, how.frame_id) for row in rows]
+    if empty := sum(row.fix is None for row in rows):
+        report.notes['empty scans'] = (
+            f'{empty} rows have a time and no position: nobody was seen then'
+        )
+    if records:
+        records += truth_records(how, report, origin)
+    known: dict[str, Any] = {
+        **origin_parameters(origin),
+        'relative_axes': 'enu' if levelled else 'flu',
+        'frame_id': how.frame_id,
+    }
+    if tags:
+        known['tags'] = list(dict.fromkeys(tags.values()))
+        numbers = tag_numbers(known['tags'])
+        report.target_names = {name: numbers[tag] for name, tag in tags.items()}
+    streams = _by_name((row.name, row.stamp_ns) for row in rows)
+    write_bag(report, records, path, how, {'diver': known}, streams)
+
+
+def _pose(
+    row: Row, stamp_ns: int, degrees: Degrees | None, levelled: bool, frame_id: str
+) -> list[tuple[str, Callable[..., Any], Any]]:
+    """Topic, writer and measurement of each part of the vessel's pose. Raises `BadRow`."""
+    heading = row.optional('heading') if levelled else row.number('heading')
+    if abs(heading) > 720.0:
+        raise BadRow(f'{row.table.header("heading")} is {heading:g} degrees')
+    yaw = 0.5 * math.pi - math.radians(0.0 if math.isnan(heading) else heading)
+    orientation = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
+    if degrees is None:
+        position = np.array([row.number('vessel_x'), row.number('vessel_y'), 0.0])
+        if np.abs(position).max() > FARTHEST:
+            raise BadRow(f'the vessel at {position[0]:g}, {position[1]:g} is not on Earth')
+        pose = VesselPose(
+            stamp_ns=stamp_ns, position=position, orientation=orientation, frame_id=frame_id
+        )
+        return [('/nav', write_navigation, pose)]
+    latitude, longitude = degrees.place(row)
+    where = VesselFix(stamp_ns=stamp_ns, latitude=latitude, longitude=longitude, frame_id='gps')
+    lies = VesselHeading(stamp_ns=stamp_ns, orientation=orientation, frame_id='vessel')
+    return [('/nav_fix', write_geodetic, where), ('/heading', write_heading, lies)]
+
+
+def _target(row: _Parsed, tags: dict[str, str], frame_id: str) -> Record:
+    """The position of a row, or the scan in which nobody was seen."""
+    if row.fix is None:
+        nobody = Fixes(stamp_ns=row.stamp_ns, position=np.empty((0, 3)), frame_id=frame_id)
+        return row.stamp_ns, '/fixes', write_scan(nobody, ros_message)
+    fix = evolve(row.fix, frame_id=tags.get(row.name, TRANSCEIVER))
+    return row.stamp_ns, '/relative', write_relative(fix, ros_message)

@@ -21,42 +21,37 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from attrs import define, Factory
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_adapters.detections import SOUND_SPEEDS
 from msg_adapters.navigation import write_navigation, write_range
-from msg_adapters.soundings import write_ground
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.geometry import quaternion
-from sonar_imm.measurements import Altitude, Ground, Navigation, Rejection
+from sonar_imm.measurements import Altitude, Navigation
 
 from ... import SECOND
-from ..conversion import ConversionReport, flags_of, JUMP, Leaps, provenance
+from ..conversion import ConversionReport, flags_of, JUMP, Leaps, new_bag
 from ..conversion import Record as Stamped
-from ..csv_table import CsvTable
 from ..messages import ros_message
 from ..places import ask_for_angle, Degrees, origin_parameters, TURN
 from ..positions import write_position
 from ..sources import BagError
+from ..table_files import CsvTable
 from ..tables import CsvOptions, Row
 from ..times import BadRow
-from ..writer import BagWriter
 
 LATEST = 2**31 * SECOND
 _SYSTEMS = {'detections': 'obstacle', 'snapshot': 'bathymetry'}
 Record = dict[str, Any]
-"""What a reader says of a ping or a picture; see `xtf.pings_of`."""
+"""What a reader says of a ping or picture, as in `xtf.pings_of`; attitude, depth and altitude are
+left out where they are not known."""
 
 
-class Message(NamedTuple):
-    """A message to be written."""
-
-    topic: str
-    content: Any
+Message = tuple[str, Any]
+"""Topic and content of a message to be written."""
 
 
 @define
@@ -88,7 +83,7 @@ class Frame:
         self.leaps.saw(record['stamp_ns'], east, north)
         depth, pitch, roll = (
             value if math.isfinite(value) else 0.0
-            for value in (record['depth'], record['pitch'], record['roll'])
+            for value in (record.get(name, math.nan) for name in ('depth', 'pitch', 'roll'))
         )
         # ENU from FLU, of degrees from north to the east, bow up, starboard down.
         angles = roll, -pitch, 90.0 - record['heading']
@@ -117,21 +112,6 @@ class Frame:
             report.notes['origin'] = f'latitude {place.latitude!r}, longitude {place.longitude!r}'
 
 
-def ground_message(ping: Record, offset: np.ndarray) -> Message:
-    """The soundings of a ping; offset (n, 3): metres east, north and up of where the ship is.
-    Raises `Rejection`."""
-    nav = ping['nav']
-    if nav is None:
-        raise Rejection('no_position', 'its soundings have no position of the ship')
-    ground = Ground(
-        stamp_ns=ping['stamp_ns'],
-        position=nav.position + offset,
-        variance=np.zeros(len(offset)),
-        frame_id=nav.frame_id,
-    )
-    return Message('/ground', write_ground(ground, ros_message))
-
-
 def write_records(
     path: Path,
     records: Iterator[Record],
@@ -143,9 +123,8 @@ def write_records(
     """Write the messages of each record and where the ship was. Raises `BagError` when there is
     none."""
     frame = Frame()
-    notes = provenance(path.name, report.notes)
     own = {} if parameters is None else parameters
-    with BagWriter(report.path, storage=how.storage, custom_data=notes, parameters=own) as bag:
+    with new_bag(report, path.name, how, own) as bag:
         for record in _in_time(records, path, report):
             stamp_ns = record['stamp_ns']
             nav, made = None, []
@@ -156,9 +135,8 @@ def write_records(
             if made and nav is not None and stamp_ns != frame.last_ns:
                 frame.last_ns = stamp_ns
                 made = [*navigation_messages(record, nav), *made]
-            for message in made:
-                bag.write(message.topic, message.content, stamp_ns)
-                report.messages[message.topic] += 1
+            for topic, message in made:
+                bag.write(topic, message, stamp_ns)
         if place := frame.parameters():
             for topic in report.messages:
                 if system := _SYSTEMS.get(topic.rpartition('/')[2]):
@@ -170,48 +148,43 @@ def write_records(
 
 def navigation_messages(record: Record, navigation: Navigation) -> Iterator[Message]:
     """Yield where the ship was and, if the record states it, its altitude."""
-    yield Message('/nav', write_navigation(navigation, ros_message))
-    altitude = float(record['altitude'])
+    yield '/nav', write_navigation(navigation, ros_message)
+    altitude = float(record.get('altitude', math.nan))
     if altitude > 0.0 and math.isfinite(altitude):
         measured = Altitude(stamp_ns=record['stamp_ns'], altitude=altitude, frame_id='sonar')
-        yield Message('/altitude', write_range(measured, ros_message))
+        yield '/altitude', write_range(measured, ros_message)
 
 
 def _in_time(records: Iterator[Record], path: Path, report: ConversionReport) -> Iterator[Record]:
     """The records whose clock can be believed: near that of the one before, or of the next."""
-    last, held = None, None
+    last: int | None = None
+    held: list[Record] = []
 
-    def lonely(record: Record) -> None:
-        report.bad_row(path, record['where'], BadRow('its clock is off', 'clock off'))
+    def leave_out_held() -> None:
+        for record in held:
+            report.bad_row(path, record['where'], BadRow('its clock is off', 'clock off'))
+        held.clear()
 
     for record in records:
         stamp_ns = record['stamp_ns']
         if not 0 < stamp_ns < LATEST:
             report.bad_row(path, record['where'], BadRow('it has no time', 'no time'))
             continue
-        if last is None or abs(stamp_ns - last) <= JUMP:
-            if held is not None:
-                lonely(held)
-        elif held is not None and abs(stamp_ns - held['stamp_ns']) <= JUMP:
+        near = last is None or abs(stamp_ns - last) <= JUMP
+        if not near and held and abs(stamp_ns - held[0]['stamp_ns']) <= JUMP:
             report.problems.append(
-                f'{path.name}, {held["where"]}: the clock jumps by '
-                f'{(held["stamp_ns"] - last) / SECOND:g} s and stays there'
+                f'{path.name}, {held[0]["where"]}: the clock jumps by '
+                f'{(held[0]["stamp_ns"] - (last or 0)) / SECOND:g} s and stays there'
             )
-            yield held
+            yield held.pop()
+            near = True
+        leave_out_held()
+        if near:
+            last = stamp_ns
+            yield record
         else:
-            if held is not None:
-                lonely(held)
-            held = record
-            continue
-        last, held = stamp_ns, None
-        yield record
-    if held is not None:
-        lonely(held)
-
-
-def speed_of(ping: Record) -> float:
-    stated = float(ping['sound_speed'])
-    return stated if SOUND_SPEEDS[0] <= stated <= SOUND_SPEEDS[1] else 1500.0
+            held.append(record)
+    leave_out_held()
 
 
 ARRAYS: dict[str, tuple[str, ...]] = {
@@ -259,25 +232,22 @@ def navigation_of_table(
 
         def parse(row: Row) -> Record:
             row.require_valid()
-            height = row.height()
-            record = {name: row.optional(name) for name in ('heading', 'roll', 'pitch')}
-            place = (
-                (row.number('x'), row.number('y')) if degrees is None else degrees.place(row)[::-1]
-            )
-            stamp_ns = row.stamp_ns()
-            return {**record, 'stamp_ns': stamp_ns, 'place': place, 'depth': -height}
+            found = {'depth': -row.height()}
+            found |= {name: row.optional(name) for name in ('heading', 'roll', 'pitch')}
+            place = degrees.place(row)[::-1] if degrees else (row.number('x'), row.number('y'))
+            return found | {
+                'place': place,
+                'stamp_ns': row.stamp_ns(),
+                'units': 'degrees' if geodetic else 'metres',
+            }
 
         rows = [record for _, record in report.read_rows(table, parse)]
         ask_for_angle(table, 'heading', (row['heading'] for row in rows))
-    units = 'degrees' if geodetic else 'metres'
     report.rows -= len(rows)  # those of the input are counted
     if on_earth and geodetic:
-        return [
-            (row['stamp_ns'], '/position', write_position(row['stamp_ns'], *row['place']))
-            for row in rows
-        ]
-    records = ({**row, 'units': units, 'altitude': math.nan} for row in rows)
-    return list(_messages(records, Path(path), report, frame or Frame()))
+        places = ((row['stamp_ns'], row['place']) for row in rows)
+        return [(stamp, '/position', write_position(stamp, *place)) for stamp, place in places]
+    return list(_messages(iter(rows), Path(path), report, frame or Frame()))
 
 
 def navigation_of_arrays(
@@ -298,24 +268,15 @@ def navigation_of_arrays(
     geodetic = {'latitude', 'longitude'} <= values.keys()
     if not geodetic and not {'x', 'y'} <= values.keys():
         return []
-    nothing = np.full(count, math.nan)
-    heading = _heading(values, path)
-    place = [values[name] for name in (('longitude', 'latitude') if geodetic else ('x', 'y'))]
-    depth = -values['z'] if 'z' in values else values.get('depth', nothing)
-    roll, pitch = (_attitude(values, name, path) for name in ('roll', 'pitch'))
-    altitude = values.get('altitude', nothing)
+    columns = {'heading': _heading(values, path)}
+    columns |= {name: values[name] for name in ('depth', 'altitude') if name in values}
+    columns |= {'depth': -values['z']} if 'z' in values else {}
+    columns |= {name: _attitude(values, name, path) for name in ('roll', 'pitch')}
+    units, axes = ('degrees', ('longitude', 'latitude')) if geodetic else ('metres', ('x', 'y'))
     records = (
-        {
-            'stamp_ns': stamps[k],
-            'units': 'degrees' if geodetic else 'metres',
-            'place': (place[0][k], place[1][k]),
-            'heading': float(heading[k]),
-            'depth': float(depth[k]),
-            'roll': float(roll[k]),
-            'pitch': float(pitch[k]),
-            'altitude': float(altitude[k]),
-        }
-        for k in range(count)
+        {'stamp_ns': stamp, 'units': units, 'place': tuple(values[axis][k] for axis in axes)}
+        | {name: float(column[k]) for name, column in columns.items()}
+        for k, stamp in enumerate(stamps)
     )
     return list(_messages(records, path, report, frame))
 
@@ -330,7 +291,7 @@ def _messages(
             navigation = frame.navigation(record)
         if navigation is not None:
             for message in navigation_messages(record, navigation):
-                yield record['stamp_ns'], message.topic, message.content
+                yield record['stamp_ns'], *message
     frame.tell(path, report)
 
 

@@ -8,16 +8,15 @@
 """Logs of NMEA 0183 sentences and AIS messages: positions of targets, and of the vessel itself.
 
 Positions of targets are those that AIS reports (``!AIVDM``: messages 1, 2, 3, 18, 19 and 27, by
-MMSI), targets with latitude and longitude (``TLL``) and tracked targets with distance and bearing
-(``TTM``), which are placed from the vessel's last position. The vessel's own position is in
-``GGA``, ``RMC``, ``GLL`` or ``GNS`` of one talker, its heading in ``HDT`` or ``THS``. Targets of
-the USBL of a vessel are in ``USRTH`` and ``PSIMSSB``, and are placed from its last position as
-well; how the vessel lies is in ``PSIMSNS``.
+MMSI) and targets with latitude and longitude (``TLL``). Tracked targets with distance and bearing
+(``TTM``) and those of the USBL of a vessel (``USRTH``, ``PSIMSSB``) are placed from the vessel's
+last position. That is in ``GGA``, ``RMC``, ``GLL`` or ``GNS`` of one talker, its heading in
+``HDT``, ``THS`` or ``PSIMSNS``.
 
-Few sentences have a whole time. In this order a time is that before the sentence (seconds since
-1970 or ISO 8601), that of its tag block (``\\c:...*hh\\``), or the vessel's clock as of the last
-sentence that had one, with the date of ``ZDA`` or ``RMC``. An AIS report says the second at which
-it was true; its time is moved there.
+In this order a time is that before the sentence (seconds since 1970 or ISO 8601), that of its tag
+block (``\\c:...*hh\\``), or the vessel's clock as of the last sentence that had one, with the date
+of ``ZDA`` or ``RMC``. An AIS report says the second at which it was true; its time is moved there.
+Each sentence is read with what those before it said, so all kinds of sentence stand here.
 """
 
 from __future__ import annotations
@@ -48,8 +47,8 @@ from ..convert_options import FixesOptions, NmeaOptions
 from ..messages import ros_message
 from ..places import check_place
 from ..sources import BagError
+from ..table_files import TrackFile
 from ..times import BadRow, iso_ns, moment_ns
-from ..track_files import TrackFile
 from .fixes import write_fixes
 
 LONGEST_LINE = 1000
@@ -82,7 +81,7 @@ class _Log:
     """What was read so far. clock: ns since 1970 of the last sentence with a time; place: of the
     vessel (latitude, longitude), degrees; std: of its position, m, NaN when nobody says."""
 
-    day: Date | None
+    day: Date | None = None
     clock: int | None = None
     of_day: Time | None = None
     place: tuple[float, float] | None = None
@@ -112,10 +111,26 @@ class _Log:
         self.no_zone += not stated
         return stated or 'UTC'
 
-    def compare(self, stamp_ns: int, clock: Time) -> None:
-        """Compare the time before a sentence with that in it."""
-        own = 3600 * clock.hour + 60 * clock.minute + clock.second
-        self.ahead.append((stamp_ns / SECOND - own + 43200.0) % 86400.0 - 43200.0)
+    def now(self) -> int:
+        """The time of the sentence that is read. Raises `BadRow`."""
+        if self.clock is not None:
+            return self.clock
+        if self.of_day is not None:
+            raise BadRow(
+                'has a time of day and no date: say that of the first line with --date 2024-05-31',
+                'no date',
+            )
+        raise BadRow(
+            'has no time, and none came before it; log a time before each line, or sentences with '
+            'a time',
+            'no time',
+        )
+
+    def bow(self) -> float:
+        """The heading, degrees, of what counts from the bow. Raises `BadRow`."""
+        if math.isnan(self.heading):
+            raise BadRow('counts from the bow and no heading came before it', 'no heading')
+        return self.heading
 
 
 @converter(NmeaOptions)
@@ -124,18 +139,14 @@ def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None
     of the vessel; where it holds no targets, the vessel's positions are the fixes.
     """
     log = _read(path, report, how)
-    as_fixes = how.own == 'fixes' or (how.own == 'auto' and not (log.targets or log.hears))
     rows, beside = log.targets, list[Record]()
-    if as_fixes:
-        rows = rows + [
-            _row(fix.stamp_ns, fix.latitude, fix.longitude, fix.height) for fix in log.own
-        ]
+    if how.own == 'fixes' or (how.own == 'auto' and not (log.targets or log.hears)):
+        rows += [_row(fix.stamp_ns, fix.latitude, fix.longitude, fix.height) for fix in log.own]
         report.notes['own'] = 'the positions of the receiver itself are the fixes'
     else:
         beside += [(fix.stamp_ns, '/nav_fix', write_geodetic(fix, ros_message)) for fix in log.own]
     beside += [
-        (heading.stamp_ns, '/heading', write_heading(heading, ros_message))
-        for heading in log.headings
+        (each.stamp_ns, '/heading', write_heading(each, ros_message)) for each in log.headings
     ]
     _tell_receivers(log, path, report, how.talker)
     _tell_zone(log, path, report)
@@ -149,38 +160,29 @@ def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None
         if log.unread and not report.problems:
             report.problems.append(f'not used: {report.notes["not used"]}')
         raise report.nothing(path)
-    table = TrackFile(path, None, rows, 'a log of NMEA sentences')
-    fixes = FixesOptions(
-        truth=how.truth,
-        truth_options=how.truth_options,
-        frame_id=how.frame_id,
-        origin=how.origin,
-        storage=how.storage,
-    )
-    lines = report.rows
-    write_fixes(table, report, fixes, beside)
+    shared = ('truth', 'truth_options', 'frame_id', 'origin', 'storage')
+    fixes, lines = FixesOptions(**{name: getattr(how, name) for name in shared}), report.rows
+    write_fixes(TrackFile(path, None, rows, 'a log of NMEA sentences'), report, fixes, beside)
     report.rows = lines
 
 
 def _tell_receivers(log: _Log, path: Path, report: ConversionReport, chosen: str) -> None:
     """Say that a log holds positions of several receivers. Raises `BagError` where they lie apart
     and nobody has chosen."""
-    talkers = log.talkers
-    two = len(log.apart) > 1 and float(np.median(log.apart)) > APART
-    if len(talkers) > 1:
-        counts = ', '.join(f'{talker} ({count})' for talker, count in talkers.most_common())
-        if two and not chosen:
-            options = ' or '.join(f'--talker {talker}' for talker in talkers)
+    apart = float(np.median(log.apart)) if len(log.apart) > 1 else 0.0
+    if len(log.talkers) > 1:
+        counts = ', '.join(f'{talker} ({count})' for talker, count in log.talkers.most_common())
+        if apart > APART and not chosen:
+            options = ' or '.join(f'--talker {talker}' for talker in log.talkers)
             raise BagError(
-                f'{path} holds positions of the talkers {counts}, which are '
-                f'{np.median(log.apart):.3g} m apart: two receivers. Say which: {options}'
+                f'{path} holds positions of the talkers {counts}, which are {apart:.3g} m apart: '
+                f'two receivers. Say which: {options}'
             )
         report.notes['talkers'] = f'{counts}: the positions of {log.talker} are used'
-    elif two:
+    elif apart > APART:
         report.questions.append(
-            f'{path.name}: {len(log.apart)} positions of one moment are '
-            f'{np.median(log.apart):.3g} m apart: are there two receivers in one log? The first '
-            'of each moment is used'
+            f'{path.name}: {len(log.apart)} positions of one moment are {apart:.3g} m apart: are '
+            'there two receivers in one log? The first of each moment is used'
         )
 
 
@@ -210,23 +212,26 @@ def _read(path: Path, report: ConversionReport, how: NmeaOptions) -> _Log:
         raise BagError(
             "logs of NMEA sentences need pyais and pynmea2: pip install 'sonar_imm[nmea]'"
         ) from None
-    said = (OWN.search(line) for _, line in _lines(path))
-    talkers = Counter(match[1] for match in said if match)
-    log = _Log(_day(how.date), talkers=talkers)
-    if how.talker and how.talker not in talkers:
+    log = _Log(
+        talkers=Counter(match[1] for _, line in _lines(path) if (match := OWN.search(line)))
+    )
+    try:
+        log.day = Date.fromisoformat(how.date) if how.date else None
+    except ValueError:
+        raise BagError(f"'{how.date}' is no date; write 2024-05-31") from None
+    if how.talker and how.talker not in log.talkers:
         raise BagError(
             f'no position in {path} is of the talker {how.talker}; there are '
-            f'{", ".join(talkers) or "none"}'
+            f'{", ".join(log.talkers) or "none"}'
         )
-    log.talker = how.talker or next((talker for talker, _ in talkers.most_common(1)), '')
+    log.talker = how.talker or next((talker for talker, _ in log.talkers.most_common(1)), '')
     wrong = (pynmea2.ParseError, pyais.exceptions.AISBaseException, BadRow, Rejection)
     for number, line in _lines(path):
+        report.rows += 1
         found = SENTENCE.match(line)
         if found is None:
-            report.rows += 1
             report.bad_row(path, f'line {number}', 'is no sentence with a checksum')
             continue
-        report.rows += 1
         try:
             stamp = _stamp(found['before'], lambda: log.zone(how.time_zone))
             sentence = found['sentence']
@@ -269,16 +274,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         raise BagError(f'{path} cannot be read: {error.strerror}') from None
 
 
-def _day(text: str) -> Date | None:
-    try:
-        return Date.fromisoformat(text) if text else None
-    except ValueError:
-        raise BagError(f"'{text}' is no date; write 2024-05-31") from None
-
-
 def _stamp(before: str, zone: Callable[[], str]) -> int | None:
-    """The time that stands before a sentence, ns since 1970, in `zone` where it names none.
-    Raises `BadRow`."""
+    """The time that stands before a sentence, ns since 1970, in `zone` where it names none."""
     if block := _TAG_BLOCK.search(before):
         number = int(block.group(1))
         return number * (10**6 if number > 10**11 else SECOND)
@@ -298,14 +295,17 @@ def _take(log: _Log, sentence: Any, stamp: int | None) -> None:
     if not kind:  # of a maker
         log.unread[sentence.identifier()] += 1
         return
-    day = _dated(sentence)
-    if day is not None and day != log.day:
+    day: Any = getattr(sentence, 'datestamp', None) if kind != 'ZDA' else None
+    if kind == 'ZDA':
+        day = Date(int(sentence.year), int(sentence.month), int(sentence.day))
+    if isinstance(day, Date) and day != log.day:
         log.day, log.of_day = day, None
     clock = getattr(sentence, 'timestamp', None)
     if stamp is not None:
         log.clock = stamp
         if clock and kind not in ('GST', 'TLL', 'TTM'):
-            log.compare(stamp, clock)
+            own = 3600 * clock.hour + 60 * clock.minute + clock.second
+            log.ahead.append((stamp / SECOND - own + 43200.0) % 86400.0 - 43200.0)
     elif clock and kind != 'GST':
         if not _CLOCK.match(str(sentence.data[sentence.name_to_idx['timestamp']])):
             raise BadRow('has a time that cannot be read as HHMMSS', 'unreadable time')
@@ -315,24 +315,20 @@ def _take(log: _Log, sentence: Any, stamp: int | None) -> None:
     elif kind == 'HDT':
         _take_heading(log, float(sentence.data[0] or 'nan'))
     elif kind == 'GST':
-        stds = [float(std) for std in (sentence.std_dev_latitude, sentence.std_dev_longitude)]
-        log.std = max(stds)
+        log.std = max(map(float, (sentence.std_dev_latitude, sentence.std_dev_longitude)))
     elif kind == 'TLL':
         log.hears = True
-        row = _row(_now(log), sentence.latitude, sentence.longitude)
+        row = _row(log.now(), sentence.latitude, sentence.longitude)
         log.targets.append(row | {'id': str(sentence.target_name or sentence.target_number)})
-    elif kind == 'TTM':
+    elif kind == 'TTM':  # by distance and bearing from the vessel
         log.hears = True
-        _take_tracked(log, sentence)
-    elif day is None:
+        bearing = float(sentence.bearing) + (log.bow() if sentence.brg_ref == 'R' else 0.0)
+        distance = float(sentence.distance) * LENGTHS.get(sentence.dist_unit or 'N', math.nan)
+        angle = math.radians(bearing)
+        away = np.array([distance * math.sin(angle), distance * math.cos(angle), 0.0])
+        _take_target(log, away, str(sentence.name or sentence.target_number))
+    elif not isinstance(day, Date):
         log.unread[kind] += 1
-
-
-def _dated(sentence: Any) -> Date | None:
-    if sentence.sentence_type == 'ZDA':
-        return Date(int(sentence.year), int(sentence.month), int(sentence.day))
-    day = getattr(sentence, 'datestamp', None)
-    return day if isinstance(day, Date) else None
 
 
 def _tell_time(log: _Log, clock: Time) -> None:
@@ -350,40 +346,21 @@ def _tell_time(log: _Log, clock: Time) -> None:
     )
 
 
-def _now(log: _Log) -> int:
-    if log.clock is None and log.of_day is not None:
-        raise BadRow(
-            'has a time of day and no date: say that of the first line with --date 2024-05-31',
-            'no date',
-        )
-    if log.clock is None:
-        raise BadRow(
-            'has no time, and none came before it; log a time before each line, or sentences with '
-            'a time',
-            'no time',
-        )
-    return log.clock
-
-
 def _take_own(log: _Log, sentence: Any) -> None:
     kind = sentence.sentence_type
     good = {'GGA': 'gps_qual', 'RMC': 'status', 'GLL': 'status', 'GNS': 'mode_indicator'}[kind]
     if not sentence.lat or str(getattr(sentence, good, '')) in ('0', 'V', 'N', 'NN'):
         raise BadRow('has no valid position', 'no position')
-    check_place(float(sentence.latitude), float(sentence.longitude))
-    stamp_ns = _now(log)
-    height = 0.0
-    if kind == 'GGA':
-        height = float(sentence.altitude or 0.0) + float(sentence.geo_sep or 0.0)
-    covariance = None
-    if log.std > 0.0:
-        covariance = np.diag([log.std**2, log.std**2, 4.0 * log.std**2])
+    latitude, longitude = float(sentence.latitude), float(sentence.longitude)
+    check_place(latitude, longitude)
+    stamp_ns = log.now()
+    height = (sentence.altitude, sentence.geo_sep) if kind == 'GGA' else ()
     fix = VesselFix(
         stamp_ns=stamp_ns,
-        latitude=float(sentence.latitude),
-        longitude=float(sentence.longitude),
-        height=height,
-        covariance=covariance,
+        latitude=latitude,
+        longitude=longitude,
+        height=sum((float(part or 0.0) for part in height), 0.0),
+        covariance=log.std**2 * np.diag([1.0, 1.0, 4.0]) if log.std > 0.0 else None,
         frame_id='gps',
     )
     apart = 0.0
@@ -411,7 +388,7 @@ def _take_heading(log: _Log, degrees: float, roll: float = 0.0, pitch: float = 0
     forward, left, up. Raises `BadRow`."""
     if not 0.0 <= degrees <= 360.0:
         raise BadRow('has no heading from 0 to 360 degrees', 'no heading')
-    log.heading, stamp_ns = degrees % 360.0, _now(log)
+    log.heading, stamp_ns = degrees % 360.0, log.now()
     if log.headings and log.headings[-1].stamp_ns == stamp_ns:
         return
     level = [angle if abs(angle) <= 90.0 else 0.0 for angle in (roll, pitch)]
@@ -423,26 +400,12 @@ def _take_heading(log: _Log, degrees: float, roll: float = 0.0, pitch: float = 0
     )
 
 
-def _take_tracked(log: _Log, sentence: Any) -> None:
-    """A target by distance and bearing from the vessel, placed from its last position."""
-    bearing = float(sentence.bearing)
-    if sentence.brg_ref == 'R':
-        if math.isnan(log.heading):
-            raise BadRow('counts from the bow and no heading came before it', 'no heading')
-        bearing += log.heading
-    distance = float(sentence.distance) * LENGTHS.get(sentence.dist_unit or 'N', math.nan)
-    angle = math.radians(bearing)
-    away = np.array([distance * math.sin(angle), distance * math.cos(angle), 0.0])
-    _take_target(log, away, str(sentence.name or sentence.target_number))
-
-
 def _take_target(log: _Log, away: FloatArray, name: str) -> None:
     """A target at `away` (3,), m east, north and up, from the last position of the vessel."""
     if log.place is None:
         raise BadRow('needs a position of the vessel before it', 'no position')
     place = Origin(*log.place, 0.0).geodetic(away)
-    row = _row(_now(log), float(place[0]), float(place[1]), float(away[2]))
-    log.targets.append(row | {'id': name})
+    log.targets.append(_row(log.now(), *map(float, (*place[:2], away[2]))) | {'id': name})
 
 
 def _fields(sentence: str) -> list[str]:
@@ -491,10 +454,9 @@ def _take_usbl(log: _Log, sentence: str, stamp: int | None) -> None:
             'are read',
             'other coordinates',
         )
-    if math.isnan(log.heading):
-        raise BadRow('counts from the bow and no heading came before it', 'no heading')
+    bow = math.radians(log.bow())
     starboard, ahead, depth = (float(number) for number in numbers[:3])
-    sine, cosine = math.sin(math.radians(log.heading)), math.cos(math.radians(log.heading))
+    sine, cosine = math.sin(bow), math.cos(bow)
     away = np.array([ahead * sine + starboard * cosine, ahead * cosine - starboard * sine, -depth])
     _take_target(log, away, name)
 
@@ -505,19 +467,17 @@ def _take_ais(log: _Log, message: Any, stamp: int | None, own: bool) -> None:
         return
     if stamp is not None:
         log.clock = stamp
-    stamp_ns, second = _now(log), getattr(message, 'second', 60)
+    stamp_ns, second = log.now(), getattr(message, 'second', 60)
     if second < 60:
-        late = (stamp_ns - int(second) * SECOND + HALF_MINUTE) % (60 * SECOND) - HALF_MINUTE
-        stamp_ns -= late
+        stamp_ns -= (stamp_ns - int(second) * SECOND + HALF_MINUTE) % (60 * SECOND) - HALF_MINUTE
     latitude, longitude = float(message.lat), float(message.lon)
     if latitude > 90.0 or longitude > 180.0:
         raise BadRow('says that it has no position', 'no position')
     if own:
         log.unread['AIS reports of the own ship (VDO)'] += 1
         return
-    std = ACCURATE if message.accuracy else INACCURATE
-    row = _row(stamp_ns, latitude, longitude)
-    log.targets.append(row | {'std': str(std), 'id': str(message.mmsi)})
+    more = {'std': str(ACCURATE if message.accuracy else INACCURATE), 'id': str(message.mmsi)}
+    log.targets.append(_row(stamp_ns, latitude, longitude) | more)
 
 
 def _row(stamp_ns: int, latitude: float, longitude: float, height: float = 0.0) -> dict[str, str]:

@@ -38,10 +38,10 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 from ..convert_options import SegyOptions
-from ..csv_writer import CsvWriter
 from ..positions import Positions
 from ..segy_lines import opened_for_change, READ_OPTIONS, read_segy, SegyLine
 from ..sources import BagError
+from . import CsvWriter
 from .points import places_of
 
 _COPIED = ('existence', 'is_bottom', 'multiple_probability')
@@ -74,8 +74,7 @@ def picks_of(
 ) -> Picks:
     """The reflectors of all records, previews left out. Raises `BagError` for estimates of another
     system."""
-    rows: list[tuple[float, ...]] = []
-    where: list[tuple[int, int, int]] = []
+    rows: list[tuple[tuple[int, ...], tuple[float, ...]]] = []
     stamps: list[int] = []
     for estimate in estimates:
         columns = estimate.columns()
@@ -89,30 +88,20 @@ def picks_of(
             if not np.isfinite(time):
                 time = 2.0 * depth / sound_speed
             std = float(np.sqrt(columns['cov_depth_depth'][k]))
-            where.append((int(columns['track_id'][k]), len(stamps), estimate.stamp_ns))
-            rows.append((time, depth, std, *(float(columns[name][k]) for name in _COPIED)))
+            where = (int(columns['track_id'][k]), len(stamps), estimate.stamp_ns)
+            own = (float(columns[name][k]) for name in _COPIED)
+            rows.append((where, (time, depth, std, *own)))
     if not rows:
         raise BagError('there are no reflectors to export')
-    order = sorted(range(len(rows)), key=lambda k: where[k])
-    places = np.array([where[k] for k in order], np.int64)
-    values = np.array([rows[k] for k in order])
-    nowhere = np.full(len(stamps), np.nan)
-    east, north = nowhere, nowhere
+    rows.sort(key=lambda row: row[0])
+    horizon, record, stamp_ns = np.array([where for where, _ in rows], np.int64).T
+    two_way_time, depths, stds, *copied = np.array([numbers for _, numbers in rows]).T
+    east = north = np.full(len(stamps), np.nan)
     if positions is not None:
         east, north = positions.at(np.array(stamps, np.int64))
-    way, at = _along(east, north), places[:, 1] - 1
-    return Picks(
-        places[:, 0],
-        places[:, 1],
-        places[:, 2],
-        values[:, 0],
-        values[:, 1],
-        values[:, 2],
-        {name: values[:, 3 + k] for k, name in enumerate(_COPIED)},
-        east[at],
-        north[at],
-        way[at],
-    )
+    line = (column[record - 1] for column in (east, north, _along(east, north)))
+    extra = dict(zip(_COPIED, copied))
+    return Picks(horizon, record, stamp_ns, two_way_time, depths, stds, extra, *line)
 
 
 def _along(longitude: FloatArray, latitude: FloatArray) -> FloatArray:
@@ -164,23 +153,26 @@ def write_geojson(path: Path, picks: Picks) -> int:
         raise BagError('the recording has no positions (sensor_msgs/NavSatFix), so no GeoJSON')
     features = []
     for k in np.flatnonzero(there):
-        place = [
-            round(float(picks.longitude[k]), 7),
-            round(float(picks.latitude[k]), 7),
-            round(-float(picks.depth[k]), 3),
-        ]
+        longitude, latitude, depth, std, time, distance = (
+            float(column[k])
+            for column in (
+                *(picks.longitude, picks.latitude, picks.depth, picks.depth_std),
+                *(picks.two_way_time, picks.distance),
+            )
+        )
         extra = {name: float(picks.columns[name][k]) for name in _COPIED}
         properties = {
             'horizon': int(picks.horizon[k]),
             'trace': int(picks.record[k]),
             'time_utc': utc_text(int(picks.stamp_ns[k])),
-            'twt_ms': round(1e3 * float(picks.two_way_time[k]), 4),
-            'depth_m': round(float(picks.depth[k]), 3),
-            'depth_std_m': round(float(picks.depth_std[k]), 3),
-            'distance_m': round(float(picks.distance[k]), 2),
+            'twt_ms': round(1e3 * time, 4),
+            'depth_m': round(depth, 3),
+            'depth_std_m': round(std, 3),
+            'distance_m': round(distance, 2),
             # JSON has no NaN.
             **{name: round(v, 3) if np.isfinite(v) else None for name, v in extra.items()},
         }
+        place = [round(longitude, 7), round(latitude, 7), round(-depth, 3)]
         features.append(feature('Point', place, properties))
     write_features(path, features)
     return int((~there).sum())

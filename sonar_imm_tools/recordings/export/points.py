@@ -14,7 +14,7 @@ that 32 bits reach 2000 km. What LAS has no field for becomes an extra dimension
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import csv
 from pathlib import Path
 from typing import Any
@@ -30,24 +30,20 @@ from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.measurements import Rejection
 from sonar_imm.soundings import COLUMNS, LATER
 
-from ..csv_writer import CsvWriter
 from ..reader import BagReader
 from ..sources import BagError, is_recording
 from ..times import GPS_EPOCH, gps_minus_utc
+from . import CsvWriter
 
+Pair = tuple[FloatArray, FloatArray]
 TOPIC = 'soundings'
 """Name of the topic of soundings in a recording, behind its namespace."""
 SCALE = 0.001
 """Metres of one count in a LAS file."""
 _LAS_EXTRAS = (
-    'vertical_uncertainty',
-    'horizontal_uncertainty',
-    'beam_angle',
-    'label_probability',
-    'range',
-    'surface',
-    'existence',
-)
+    'vertical_uncertainty', 'horizontal_uncertainty', 'beam_angle', 'label_probability', 'range',
+    'surface', 'existence',
+)  # fmt: skip
 
 
 @frozen(eq=False)
@@ -112,30 +108,40 @@ def read_points(path: Path) -> Points:
     recording of `~/soundings`. Raises `BagError` for what is none."""
     if is_recording(path):
         return _read_recording(path)
-    wanted = ['stamp_ns', *(name for name in COLUMNS if name not in (*PLACES, *LATER))]
     if path.suffix == '.parquet':
-        return _points_of(path, wanted)
+        table = read_parquet(path)
+        header = _checked_header(path, table.column_names)
+        try:
+            stamps = table['stamp_ns'].to_numpy().astype(np.int64)
+            columns = {name: table[name].to_numpy().astype(np.float64) for name in header}
+        except (ValueError, TypeError, OverflowError, RuntimeError):  # as pyarrow has them too
+            raise BagError(f'{path} has a column that is not numbers throughout') from None
+        return _exact(stamps, columns)
     try:
         with path.open(encoding='utf-8', newline='') as file:
             reader = csv.reader(file)
-            header = next(reader, [])
-            if missing := [name for name in wanted if name not in header]:
-                raise BagError(f'{path} has no column {" and ".join(missing)}')
+            names = next(reader, [])
+            header = _checked_header(path, names)
             rows = list(reader)
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise BagError(f'{path} is no CSV: {error}') from None
     try:
-        stamps = np.array([int(row[header.index('stamp_ns')]) for row in rows], np.int64)
-        columns = {
-            name: np.array([float(row[header.index(name)]) for row in rows])
-            for name in COLUMNS
-            if name in header
-        }
+        stamps = np.array([int(row[names.index('stamp_ns')]) for row in rows], np.int64)
+        columns = {n: np.array([float(row[names.index(n)]) for row in rows]) for n in header}
     except (ValueError, IndexError, OverflowError):
         raise BagError(f'{path} has a row that is not numbers throughout') from None
     return _exact(stamps, columns)
+
+
+def _checked_header(path: Path, names: Sequence[str]) -> list[str]:
+    """The columns of soundings that a table has. Raises `BagError` where one that it needs is
+    missing."""
+    wanted = ['stamp_ns', *(name for name in COLUMNS if name not in (*PLACES, *LATER))]
+    if missing := [name for name in wanted if name not in names]:
+        raise BagError(f'{path} has no column {" and ".join(missing)}')
+    return [name for name in COLUMNS if name in names]
 
 
 def read_parquet(path: Path) -> Any:
@@ -149,22 +155,6 @@ def read_parquet(path: Path) -> Any:
     except (OSError, pyarrow.ArrowException) as error:
         sentence = ' '.join(str(error).split())
         raise BagError(f'{path} cannot be read: {sentence}') from None
-
-
-def _points_of(path: Path, wanted: list[str]) -> Points:
-    table = read_parquet(path)
-    if missing := [name for name in wanted if name not in table.column_names]:
-        raise BagError(f'{path} has no column {" and ".join(missing)}')
-    try:
-        stamps = table['stamp_ns'].to_numpy().astype(np.int64)
-        columns = {
-            name: table[name].to_numpy().astype(np.float64)
-            for name in COLUMNS
-            if name in table.column_names
-        }
-    except (ValueError, TypeError, OverflowError, RuntimeError):  # as pyarrow has them too
-        raise BagError(f'{path} has a column that is not numbers throughout') from None
-    return _exact(stamps, columns)
 
 
 def topics_of_soundings(reader: BagReader) -> list[str]:
@@ -276,22 +266,19 @@ def wkt_of(epsg: int) -> str:
         raise BagError(f'there is no coordinate system with the EPSG number {epsg}') from None
 
 
-def places_of(
-    longitude: FloatArray, latitude: FloatArray, epsg: int
-) -> tuple[FloatArray, FloatArray]:
+def places_of(longitude: FloatArray, latitude: FloatArray, epsg: int) -> Pair:
     """x and y (n,) in a coordinate system of degrees (n,). Raises `BagError`. Needs rasterio."""
-    wkt = wkt_of(epsg)
-    from rasterio.warp import transform
-
-    x, y = transform('EPSG:4326', wkt, longitude.tolist(), latitude.tolist())
-    return np.array(x), np.array(y)
+    return _transformed('EPSG:4326', wkt_of(epsg), longitude, latitude)
 
 
-def degrees_of(places: FloatArray, epsg: int) -> tuple[FloatArray, FloatArray]:
+def degrees_of(places: FloatArray, epsg: int) -> Pair:
     """Longitude and latitude (n,) of places (n, 2) in a coordinate system. Raises `BagError`.
     Needs rasterio."""
-    wkt = wkt_of(epsg)
+    return _transformed(wkt_of(epsg), 'EPSG:4326', places[:, 0], places[:, 1])
+
+
+def _transformed(here: str, there: str, x: FloatArray, y: FloatArray) -> Pair:
     from rasterio.warp import transform
 
-    east, north = transform(wkt, 'EPSG:4326', places[:, 0].tolist(), places[:, 1].tolist())
-    return np.array(east), np.array(north)
+    first, second = transform(here, there, x.tolist(), y.tolist())
+    return np.array(first), np.array(second)

@@ -27,8 +27,8 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.texts import visible
 
-from ..csv_writer import CsvWriter
 from ..sources import BagError
+from . import CsvWriter
 from .horizons import feature, utc_text, write_features
 from .points import degrees_of
 
@@ -85,13 +85,11 @@ def tracks_of(
     parts = [part for part in parts if len(part['stamp_ns'])]
     if not parts:
         raise BagError('there are no confirmed tracks to export')
-    columns_of_any = dict.fromkeys(name for part in parts for name in part)
-    columns = {
-        name: np.concatenate(
+    columns = {}
+    for name in dict.fromkeys(name for part in parts for name in part):
+        columns[name] = np.concatenate(
             [part.get(name, np.full(len(part['stamp_ns']), np.nan)) for part in parts]
         )
-        for name in columns_of_any
-    }
     if names and 'target_id' in columns:
         ids = (str(int(each)) if np.isfinite(each) else '' for each in columns['target_id'])
         columns['target_name'] = np.array([names.get(each, '') for each in ids])
@@ -109,51 +107,41 @@ def _rows(estimate: Estimate) -> dict[str, NDArray[Any]]:
     if 'track_state' not in given or 'px' not in given:
         raise BagError('these estimates hold no tracks: only divers and obstacles have them')
     kept = np.asarray(given['track_state']) > 0
+    unknown = np.full(len(kept), np.nan)
+
+    def column(name: str) -> FloatArray:
+        return np.asarray(given.get(name, unknown), float)[kept]
+
     # The place of an obstacle has a covariance of its own; a diver's is part of the state.
     prefix = 'place_cov_{}_{}' if 'place_cov_x_x' in given else 'cov_p{}_p{}'
-    xx, xy, yy = (
-        np.asarray(given[prefix.format(*pair)], float)[kept] for pair in ('xx', 'xy', 'yy')
-    )
-    major, minor, angle = _ellipses(xx, xy, yy)
-    vx, vy = (np.asarray(given[name], float)[kept] for name in ('vx', 'vy'))
+    covariance = (column(prefix.format(*pair)) for pair in ('xx', 'xy', 'yy'))
+    major, minor, angle = _ellipses(*covariance)
+    vx, vy = column('vx'), column('vy')
     count = int(kept.sum())
-    utc = utc_text(estimate.stamp_ns)
     rows: dict[str, NDArray[Any]] = {
         'stamp_ns': np.full(count, estimate.stamp_ns, np.int64),
-        'time_utc': np.full(count, utc),
+        'time_utc': np.full(count, utc_text(estimate.stamp_ns)),
         'track_id': np.asarray(given['track_id'], np.int64)[kept],
         'state': np.where(np.asarray(given['track_state'])[kept] == 1, 'confirmed', 'coasting'),
-        'latitude': np.asarray(given.get('latitude', np.full(len(kept), np.nan)), float)[kept],
-        'longitude': np.asarray(given.get('longitude', np.full(len(kept), np.nan)), float)[kept],
-        'x': np.asarray(given['px'], float)[kept],
-        'y': np.asarray(given['py'], float)[kept],
-        'z': np.asarray(given.get('pz', np.full(len(kept), np.nan)), float)[kept],
+        **{name: column(name) for name in ('latitude', 'longitude')},
+        **{axis: column(f'p{axis}') for axis in 'xyz'},
         'std_major': major,
         'std_minor': minor,
         'major_azimuth_deg': np.degrees(angle) % 180.0,
         'speed': np.hypot(vx, vy),
         'course_deg': np.degrees(np.arctan2(vx, vy)) % 360.0,
     }
-    models = _models(given)
-    probabilities = np.column_stack([np.asarray(given[name], float)[kept] for name in models])
-    labels = np.array([name.removeprefix('prob_').removeprefix('family_') for name in models])
-    rows['model'] = labels[np.argmax(np.nan_to_num(probabilities), axis=1)]
-    extras = ('target_id', 'existence', 'collision_probability', 'vertical_offset_lo')
-    for name in (*models, *extras, 'vertical_offset_hi'):
-        if name in given:
-            rows[name] = np.asarray(given[name], float)[kept]
-    return rows
-
-
-def _models(given: dict[str, Any]) -> list[str]:
-    """The probabilities that say what a target does: of families of models, of behaviours, or of
-    the models themselves."""
+    # What a target does: by families of models, by behaviours, or by the models themselves.
     families = [name for name in given if name.startswith('family_')]
-    if families:
-        return families
     models = [name for name in given if name.startswith('prob_')]
     behaviours = [name for name in models if name not in ('prob_above', 'prob_below')]
-    return behaviours or models
+    models = families or behaviours or models
+    labels = np.array([name.removeprefix('prob_').removeprefix('family_') for name in models])
+    probabilities = np.column_stack([column(name) for name in models])
+    rows['model'] = labels[np.argmax(np.nan_to_num(probabilities), axis=1)]
+    extras = ('target_id', 'existence', 'collision_probability', 'vertical_offset_lo')
+    more = (*models, *extras, 'vertical_offset_hi')
+    return rows | {name: column(name) for name in more if name in given}
 
 
 def _ellipses(
@@ -171,11 +159,8 @@ def _ellipses(
 def write_tracks(path: Path, tracks: Tracks, kind: str, name: str) -> int:
     """Write a file of a kind of `FORMATS`; name: of the run. Gives how many rows have no place on
     Earth and were left out. Raises `BagError` when all are."""
-    if kind == 'csv':
-        _write_csv(path, tracks)
-        return 0
-    if kind == 'parquet':
-        _write_parquet(path, tracks)
+    if kind in ('csv', 'parquet'):
+        {'csv': _write_csv, 'parquet': _write_parquet}[kind](path, tracks)
         return 0
     there = np.isfinite(tracks.columns['latitude'])
     if not there.any():
@@ -320,9 +305,10 @@ def write_obstacles(
     landmarks: as run.json has them, see `trackers.obstacle.memory.Landmark.row`; origin: of their
     frame in the coordinate system `epsg`. Raises `BagError`. Needs rasterio."""
     places = np.array([[each[axis] for axis in 'xyz'] for each in landmarks]) + origin
-    longitude, latitude = degrees_of(places[:, :2], epsg)
+    heights = places[:, 2].tolist()
+    longitudes, latitudes = (axis.tolist() for axis in degrees_of(places[:, :2], epsg))
     features = []
-    for k, each in enumerate(landmarks):
+    for each, longitude, latitude, height in zip(landmarks, longitudes, latitudes, heights):
         std = {f'{axis}_std_m': each[f'cov_{axis}_{axis}'] ** 0.5 for axis in 'xyz'}
         band = {f'{name}_m': each[name] + origin[2] for name in ('z_low', 'z_high')}
         properties = {
@@ -331,10 +317,6 @@ def write_obstacles(
             **{name: round(value, 3) for name, value in (std | band).items()},
             'last_seen_utc': utc_text(int(each['seen_ns'])),
         }
-        place = [
-            round(float(longitude[k]), 8),
-            round(float(latitude[k]), 8),
-            round(float(places[k, 2]), 3),
-        ]
+        place = [round(longitude, 8), round(latitude, 8), round(height, 3)]
         features.append(feature('Point', place, properties))
     write_features(path, features)

@@ -57,14 +57,8 @@ class Message:
         return self.changed(move)
 
 
-@frozen
-class Action:
-    """Something done to the rig between two messages."""
-
-    run: Callable[[Any], None]
-
-
-Step = Message | Action
+Step = Message | Callable[[Any], None]
+"""What is sent, or done to the rig between two messages."""
 
 
 @frozen

@@ -14,10 +14,11 @@ import os
 from pathlib import Path
 import re
 import time
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
-from attrs import define, field, frozen
+from attrs import define, field
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
@@ -35,7 +36,7 @@ from sonar_imm_tools.replay.harness import local_discovery, reserved_domain_id
 from sonar_imm_tools.replay.link import Link
 from sonar_imm_tools.replay.lockstep import LockStep, Recorder
 
-from .cases import Action, Message, SECOND
+from .cases import Message, SECOND
 
 TESTS = str(Path(__file__).resolve().parents[2])
 QUICK_NODE = 'helpers.faults.quick_node'
@@ -46,21 +47,6 @@ _PATIENCE = 300.0
 """Seconds of waiting for what comes soon where a machine is not loaded."""
 _REPORTS = 12
 """Reports of /diagnostics in a disturbed part, a third or more of which is the fault."""
-
-
-@frozen
-class Outcome:
-    """What a fault did. recovered: messages on the primary input until all later estimates agree
-    with the undisturbed run, None for never; estimates: in the rest, of how many; losses: counted
-    in /diagnostics, by reason; levels, words: of /diagnostics meanwhile, and of the log; answered:
-    whether the node goes on answering messages."""
-
-    recovered: int | None
-    estimates: tuple[int, int]
-    losses: dict[str, int]
-    levels: frozenset[str]
-    words: str
-    answered: bool
 
 
 @define
@@ -249,10 +235,10 @@ class Rig:
         start = len(self.recorder)
         every = len(steps) // reports + 1 if reports else len(steps) + 1
         for number, step in enumerate(steps, start=1):
-            if isinstance(step, Action):
-                step.run(self)
-            else:
+            if isinstance(step, Message):
                 self.send(step)
+            else:
+                step(self)
             if number % every == 0:
                 self.fresh_diagnostics()
         return self.recorder.estimates(start)
@@ -263,7 +249,13 @@ class Rig:
         return first_words(self.play(self.case.messages()))
 
     def suffer(self, disturb, expected):
-        """Let a fault happen to the node, and see how long it is felt. expected: `undisturbed`."""
+        """Let a fault happen to the node, and see how long it is felt. expected: `undisturbed`.
+
+        Gives recovered: messages on the primary input until all later estimates agree with the
+        undisturbed run, None for never; estimates: in the rest, of how many; losses: counted in
+        /diagnostics, by reason; levels, words: of /diagnostics meanwhile, and of the log;
+        answered: whether the node goes on answering messages.
+        """
         self.reset()
         self.enable(True)
         self.fresh_diagnostics()
@@ -285,11 +277,11 @@ class Rig:
         answered = sum(stamp in found for stamp in origins)
         lost = self.diagnostics.counts()
         lost.subtract({key: n for key, n in before.items() if lost[key] >= n})
-        return Outcome(
+        return SimpleNamespace(
             recovered=_until_held(held),
             estimates=(answered, len(held)),
             losses={k: n for k, n in sorted(lost.items()) if n > 0 and not NO_LOSS.match(k)},
-            levels=frozenset(self.diagnostics.levels),
+            levels={*self.diagnostics.levels},
             words='\n'.join([*sorted(self.diagnostics.words), self.node.log()]),
             answered=self.lockstep.counts.messages > messages,
         )

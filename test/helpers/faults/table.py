@@ -18,7 +18,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from msg_adapters.table import decode_table, encode_table
 from sonar_imm.nodes.messages import make
 
-from .cases import Action, CASES, Message, SECOND, Step
+from .cases import CASES, Message, SECOND, Step
+from .rig import Rig
 
 Parts = tuple[list[Step], list[Step]]
 Disturbance = Callable[[list[Message], list[Message], list[Message]], Parts]
@@ -132,26 +133,26 @@ def columns(**factors):
 @middle
 def burst(during):
     """All messages at once, as after a stall of the network."""
-    return [Action(lambda rig: rig.send_at_once(during))]
+    return [lambda rig: rig.send_at_once(during)]
 
 
 @middle
 def sensor_restarted(during):
     """A driver ends, and another process of it begins after a while."""
     third = len(during) // 3
-    return [*during[:third], Action(lambda rig: rig.new_publishers()), *during[2 * third :]]
+    return [*during[:third], Rig.new_publishers, *during[2 * third :]]
 
 
 @middle
 def node_reset(during):
     """The service ~/reset in the middle of the stream."""
-    return [*during[:-1], Action(lambda rig: rig.reset()), during[-1]]
+    return [*during[:-1], Rig.reset, during[-1]]
 
 
 @middle
 def disabled(during):
     """Input is not used for a while: ~/enable with false, then with true."""
-    return [Action(lambda rig: rig.enable(False)), *during, Action(lambda rig: rig.enable(True))]
+    return [lambda rig: rig.enable(False), *during, lambda rig: rig.enable(True)]
 
 
 @middle
@@ -163,9 +164,7 @@ def parameter_storm(during):
         for wrong in (float('nan'), 'soon', 1e30, True):
             assert rig.set_parameters(max_wait=wrong, stale_after=10.0) == [False, True]
 
-    return [
-        step for item in during for step in ([item, Action(storm)] if item.primary else [item])
-    ]
+    return [step for item in during for step in ([item, storm] if item.primary else [item])]
 
 
 @middle
@@ -182,20 +181,19 @@ def unheard_publisher(during, qos):
         finally:
             rig.link.node.destroy_publisher(peer)
 
-    return [Action(publish), *during]
+    return [publish, *during]
 
 
 def simulated_clock(seconds):
     """/clock follows the stamps, and jumps with them after the first third."""
 
     def split(message):
-        return [Action(lambda rig: rig.tell_clock(message.stamp_ns)), message]
+        return [lambda rig: rig.tell_clock(message.stamp_ns), message]
 
     def disturb(before, during, after):
         rest = [step.moved(seconds) for step in [*during, *after]]
-        first = Action(lambda rig: rig.wait_for_clock(rest[0].stamp_ns, back=seconds < 0.0))
         start, end = ([step for item in part for step in split(item)] for part in (before, rest))
-        return start, [first, *end]
+        return start, [lambda rig: rig.wait_for_clock(rest[0].stamp_ns, back=seconds < 0.0), *end]
 
     return disturb
 
@@ -203,7 +201,7 @@ def simulated_clock(seconds):
 @middle
 def long_enough(during):
     """Nothing but time, until the node says that it cannot save its state."""
-    return [*during, Action(lambda rig: rig.warned_of('the state cannot be saved'))]
+    return [*during, lambda rig: rig.warned_of('the state cannot be saved')]
 
 
 # -- the table ------------------------------------------------------------------------------------

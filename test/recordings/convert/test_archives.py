@@ -21,8 +21,7 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.geometry import rotation_of_quaternion
 from sonar_imm.measurements import Navigation
 from sonar_imm_tools.cli.track import Plan
-from sonar_imm_tools.recordings.convert import convert_hydrophones, convert_snapshots, KINDS
-from sonar_imm_tools.recordings.sniffing import sniff
+from sonar_imm_tools.recordings.convert import convert_hydrophones, convert_snapshots, KINDS, sniff
 from sonar_imm_tools.recordings.sources import BagError
 
 SECOND = 10**9

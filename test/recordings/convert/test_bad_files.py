@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.convert import sniff
 from sonar_imm_tools.recordings.reader import BagReader
-from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 
 READ = [each for each in FORMATS if each.kind != 'none']

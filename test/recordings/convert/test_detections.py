@@ -15,9 +15,13 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from sonar_imm_tools.recordings.convert import convert_arrivals, convert_detections, CsvOptions
+from sonar_imm_tools.recordings.convert import (
+    convert_arrivals,
+    convert_detections,
+    CsvOptions,
+    sniff,
+)
 from sonar_imm_tools.recordings.convert.detections import compare_clocks, gather, Received
-from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 
 SECOND, SPEED, BEGIN = 10**9, 1480.0, 1_717_149_600 * 10**9

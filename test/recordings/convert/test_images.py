@@ -80,14 +80,10 @@ def test_images_become_pings_also_empty_ones_and_navigation_comes_along(bag, tmp
     assert [ping.range[0] for ping in pings if len(ping)] == [31.5, 31.0, 30.5, 29.5]
     assert pings[0].bearing[0] == pytest.approx(BEARINGS[5]) and BEARINGS[5] > 0.0
     assert sum(isinstance(item, Navigation) for item in received) == 6
-
-
-def test_a_bag_without_images_and_a_wrong_setting_are_one_sentence(bag, tmp_path, capsys):
-    out, first = tmp_path / 'out', tmp_path / 'first'
-    order = '--set', 'image_order=sideways'
-    assert 'image_order' in refused(capsys, 'images', bag, out, *order)
-    converted('images', bag, first, '--set', 'image_order=beam_major', capsys=capsys)
-    assert 'has no topic with' in refused(capsys, 'images', first, out)
+    # A wrong setting and a bag without images are one sentence.
+    order, other = ('--set', 'image_order=sideways'), tmp_path / 'other'
+    assert 'image_order' in refused(capsys, 'images', bag, other, *order)
+    assert 'has no topic with' in refused(capsys, 'images', out, other)
 
 
 def oculus(second):
@@ -112,13 +108,20 @@ def ping360(angle, second):
     )  # fmt: skip
 
 
-def test_pings_of_an_oculus_in_a_bag_become_detections(tmp_path, capsys):
+def test_pings_of_an_oculus_become_detections_and_several_topics_have_to_be_chosen_from(
+    tmp_path, capsys
+):
     pings = [(k * 10**9, '/oculus/ping', oculus(k)) for k in range(1, 4)]
     bag, out = marine.write_bag(tmp_path / 'bag', pings), tmp_path / 'out'
     assert converted('images', bag, out, capsys=capsys)['messages'] == {'/detections': 3}
     for ping in measured(out, 'obstacle'):
         assert ping.range == pytest.approx([25.25], abs=0.1)
         assert ping.bearing == pytest.approx([-np.radians(10.0)], abs=0.01)
+    pings = [(10**9, f'/{side}/ping', oculus(1)) for side in ('port', 'starboard')]
+    bag, out = marine.write_bag(tmp_path / 'two', pings), tmp_path / 'one'
+    assert '--topic /port/ping' in refused(capsys, 'images', bag, out)
+    refused(capsys, 'images', bag, out, '--topic', '/nowhere')
+    converted('images', bag, out, '--topic', '/starboard/ping', capsys=capsys)
 
 
 def test_directions_of_a_ping360_in_a_bag_are_gathered_into_sweeps(tmp_path, capsys):
@@ -135,14 +138,6 @@ def test_directions_of_a_ping360_in_a_bag_are_gathered_into_sweeps(tmp_path, cap
     for ping in measured(out, 'obstacle'):
         assert ping.range == pytest.approx([10.1], abs=0.2)
         assert ping.bearing == pytest.approx([0.2], abs=0.02)
-
-
-def test_several_topics_of_images_have_to_be_chosen_from(tmp_path, capsys):
-    pings = [(10**9, f'/{side}/ping', oculus(1)) for side in ('port', 'starboard')]
-    bag, out = marine.write_bag(tmp_path / 'bag', pings), tmp_path / 'out'
-    assert '--topic /port/ping' in refused(capsys, 'images', bag, out)
-    refused(capsys, 'images', bag, out, '--topic', '/nowhere')
-    converted('images', bag, out, '--topic', '/starboard/ping', capsys=capsys)
 
 
 def test_what_the_sonar_says_beside_its_images_is_used_from_its_message_on(tmp_path, capsys):

@@ -20,12 +20,11 @@ import yaml
 
 from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.recordings.convert import convert_segy
-from sonar_imm_tools.recordings.convert.segy import doubted_spacing, measured_instrument
+from sonar_imm_tools.recordings.convert import convert_segy, sniff
+from sonar_imm_tools.recordings.convert.fathometer import doubted_spacing, measured_instrument
 from sonar_imm_tools.recordings.positions import read_positions
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.segy_lines import read_segy
-from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.recordings.times import gps_minus_utc
 

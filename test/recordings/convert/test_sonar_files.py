@@ -22,11 +22,10 @@ import yaml
 from msg_adapters.soundings import read_ground
 from sonar_imm.measurements import Detections, Navigation, Snapshot
 from sonar_imm_tools.recordings.conversion import ConversionReport
-from sonar_imm_tools.recordings.convert import convert_pictures, convert_xtf
+from sonar_imm_tools.recordings.convert import convert_pictures, convert_xtf, sniff
+from sonar_imm_tools.recordings.convert.xtf import pings_of
 from sonar_imm_tools.recordings.reader import BagReader
-from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
-from sonar_imm_tools.recordings.xtf import pings_of
 
 SIDES = [('port', 'port', 'uint16'), ('stbd', 'starboard', 'uint16')]
 

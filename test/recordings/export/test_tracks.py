@@ -164,17 +164,14 @@ def points(n=300, seed=2):
     return Points(stamps, columns)
 
 
-def test_xyz_is_read_by_numpy(tmp_path):
+def test_xyz_is_read_by_numpy_and_las_by_laspy(tmp_path):
     item = points()
     clouds.write_xyz(tmp_path / 'a.xyz', item)
     wanted = [*(item[name] for name in 'xyz'), np.sqrt(item['vertical_uncertainty'])]
     table = np.loadtxt(tmp_path / 'a.xyz')
     assert table[:, :4] == pytest.approx(np.transpose(wanted), abs=5.1e-4)
-
-
-def test_las_is_read_by_laspy(tmp_path):
     laspy = pytest.importorskip('laspy')
-    item = points().moved((500_000.0, 6_000_000.0, 0.0))
+    item = item.moved((500_000.0, 6_000_000.0, 0.0))
     for name in ('a.las', 'a.laz'):
         clouds.write_las(tmp_path / name, item, 32632)
         las = laspy.read(tmp_path / name)
@@ -192,29 +189,24 @@ def test_las_is_read_by_laspy(tmp_path):
     assert (tmp_path / 'a.laz').stat().st_size < (tmp_path / 'a.las').stat().st_size
 
 
-def test_broken_tables_are_refused(tmp_path):
+def test_places_of_a_table_are_the_exact_ones_and_broken_ones_are_refused(tmp_path):
     path, head = tmp_path / 'soundings.csv', ','.join(['stamp_ns', *COLUMNS])
+    for exact, x in ((True, 500000.001), (False, 500000.0)):
+        names = [name for name in COLUMNS if exact or name not in PLACES]
+        row = dict.fromkeys(names, '1') | {'x': '500000.0', 'px': '500000.001'}
+        cells = ','.join(['7', *(row[name] for name in names)])
+        path.write_text(','.join(['stamp_ns', *names]) + f'\n{cells}\n')
+        read = read_points(path)
+        assert read['x'].tolist() == [x] and not set(PLACES) & set(read.columns)
     for text, words in (
-        ('stamp_ns,x,y\n', 'no column z and'),
-        (f'{head}\n1,2\n', 'not numbers'),
+        ('stamp_ns,x,y\n', 'no column z and'), (f'{head}\n1,2\n', 'not numbers'),
         (f'{head}\n{",".join("a" * 12)}\n', 'not numbers'),
-    ):
+    ):  # fmt: skip
         path.write_text(text)
         with pytest.raises(BagError, match=words):
             read_points(path)
     with pytest.raises(BagError, match='cannot be read'):
         read_points(tmp_path / 'none.csv')
-
-
-def test_places_of_a_table_are_the_exact_ones_where_it_has_them(tmp_path):
-    path = tmp_path / 'soundings.csv'
-    for exact, x in ((True, 500000.001), (False, 500000.0)):
-        names = [name for name in COLUMNS if exact or name not in PLACES]
-        row = dict.fromkeys(names, '1') | {'x': '500000.0', 'px': '500000.001'}
-        lines = [','.join(['stamp_ns', *names]), ','.join(['7', *(row[name] for name in names)])]
-        path.write_text('\n'.join(lines) + '\n')
-        read = read_points(path)
-        assert read['x'].tolist() == [x] and not set(PLACES) & set(read.columns)
 
 
 # -- soundings in coordinate systems and in the frame of other lines

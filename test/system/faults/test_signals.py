@@ -106,20 +106,11 @@ def reason_unclean(node, expected):
     try:
         code = node.process.wait(END_LIMIT)
     except subprocess.TimeoutExpired:
-        code = f'none within {END_LIMIT:g} s: {_doing(node.process.pid)}'
+        code = f'none within {END_LIMIT:g} s'
     message = own_words(node.log())
     words = [word for word in ('Traceback', 'Error', 'terminate called') if word in message]
     wrong = words or code != expected
     return [(node.system, f'exit code {code}, {words}: {message[-500:]}')] if wrong else []
-
-
-def _doing(pid):
-    """State and CPU seconds of each thread: whether a process hangs or only gets no processor."""
-    given = []
-    for task in Path(f'/proc/{pid}/task').iterdir():
-        words = (task / 'stat').read_text().rpartition(')')[2].split()
-        given.append(f'{words[0]} {(int(words[11]) + int(words[12])) / 100.0:g} s')
-    return ', '.join(given)
 
 
 def heeds_signals(process):

@@ -6,42 +6,56 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Traces of a sub-bottom profiler from SEG-Y, the format of seismic instruments.
+"""Traces of a sub-bottom profiler from SEG-Y, and the sound of an array of hydrophones.
 
-`segy_lines` reads the file. The interval that small profilers state is often wrong: where it does
-not go with the depth of the water that the headers state, that is said, and the sample spacing has
-to be given. Where delay or interval change along the line, so do the depths of the traces.
+The interval that small profilers state is often wrong: where it does not go with the depth of the
+water that the headers state, that is said, and the sample spacing has to be given. Where delay or
+interval change along the line, so do the depths of the traces.
 
 Traces that are never negative are envelopes. For them the pulse and the noise are measured as the
-tracker does (`measure_line`), from six hundred traces all along the line at most, and written
-beside the bag, where the tracker finds them. Where a gain that grows with time raises the noise
-with the depth, each trace states it by depth. Places become the topic ``/position``.
+tracker does, from six hundred traces all along the line at most, and written beside the bag. Where
+a gain that grows with time raises the noise with the depth, each trace states it by depth.
+
+Sound (WAV or FLAC, one channel for each hydrophone) is read in blocks, so that the length of a
+file does not matter. What a full scale is worth in pascals is an option: the tracker needs ratios
+only. Whole numbers of 16 bits stay as they are.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import groupby
 import json
 import math
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+import re
+import time
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_adapters.array_records import write_trace
+from msg_adapters.array_records import write_pressure, write_trace
 from sonar_imm.acoustics.envelopes import is_envelope
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import Trace
+from sonar_imm.measurements import Pressure, Trace
 from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm.trackers.fathometer.water import measure_line
 
-from ..conversion import ConversionReport, converter, Record, write_bag
-from ..convert_options import SegyOptions
+from ... import SECOND
+from ..conversion import ConversionReport, converter, new_bag, Record, write_bag
+from ..convert_options import HydrophonesOptions, SegyOptions
 from ..messages import ros_message
 from ..positions import write_position
 from ..segy_lines import READ_OPTIONS, read_segy, SegyLine
 from ..sources import BagError
+from ..times import BadRow, moment_ns
+from ..writer import BagWriter
 from .navigation import navigation_of_table
+
+if TYPE_CHECKING:
+    import soundfile
 
 GRID_OPTIONS = ('sound_speed', 'sample_spacing', 'depth_offset')
 _LEAST_ARRIVALS, _NEAR = 10, 1.5
@@ -76,15 +90,26 @@ def convert_segy(path: Path, how: SegyOptions, report: ConversionReport) -> None
     own, sigma = _instrument(report, amplitude, usual.spacing, how.stack)
     if own and how.first_sample:
         # The transmit pulse is left out: what comes first may be a shallow floor.
-        own['blanking'] = max(
-            0.0, math.floor(100.0 * min(w.depth(line)[0] for w in windows)) / 100.0
-        )
+        first = min(window.depth(line)[0] for window in windows)
+        own['blanking'] = max(0.0, math.floor(100.0 * first) / 100.0)
     records: list[Record] = []
     for window in windows:
-        noise = sigma
+        depth, noise = window.depth(line), sigma
         if sigma is not None and window is not usual:
-            noise = np.interp(window.depth(line), usual.depth(line), sigma)
-        records += _records(report, path, line, window, noise, how)
+            noise = np.interp(depth, usual.depth(line), sigma)
+        for begin in range(window.rows.start, window.rows.stop - how.stack + 1, how.stack):
+            report.rows += how.stack
+            rows = slice(begin, begin + how.stack)
+            stamp = line.stamps[rows.stop - 1]
+            with report.leaving_out(path, f'trace {begin}'):
+                trace = Trace(
+                    stamp_ns=stamp,
+                    frame_id=how.frame_id,
+                    depth=depth,
+                    amplitude=line.amplitude[rows, window.samples].mean(axis=0),
+                    sigma=noise,
+                )
+                records.append((stamp, '/trace', write_trace(trace, ros_message)))
     if records:
         beside = navigation_of_table(how.nav, how.nav_options, report, on_earth=True)
         records += beside or _positions(line)
@@ -109,7 +134,6 @@ class Window(NamedTuple):
 
 
 def _windows(line: SegyLine, how: SegyOptions) -> list[Window]:
-    """Return the windows of the line, in order."""
     spacing = line.spacing(how.sound_speed, how.sample_spacing)
     first = line.first_depth(how.sound_speed, how.depth_offset)
     begins = np.flatnonzero((np.diff(spacing) != 0.0) | (np.diff(first) != 0.0)) + 1
@@ -123,34 +147,25 @@ def _windows(line: SegyLine, how: SegyOptions) -> list[Window]:
 
 def _note_windows(report: ConversionReport, windows: list[Window], how: SegyOptions) -> None:
     """Note where the samples lie, for the reader and for the export of horizons."""
-    for name, values, unit in (
-        ('sample_spacing', {window.spacing for window in windows}, 'm'),
-        ('depth_of_sample_0', {window.first for window in windows}, 'm'),
+    for name, values in (
+        ('sample_spacing', [window.spacing for window in windows]),
+        ('depth_of_sample_0', [window.first for window in windows]),
     ):
         low, high = min(values), max(values)
-        changes = f'{low:.9g} to {high:.9g} {unit}, as the headers state trace by trace'
-        report.notes[name] = f'{low:.9g} {unit}' if low == high else changes
+        changes = f'{low:.9g} to {high:.9g} m, as the headers state trace by trace'
+        report.notes[name] = f'{low:.9g} m' if low == high else changes
     report.notes['stack'] = str(how.stack)
-    usual = SegyOptions()
-    own = {name: getattr(how, name) for name in (*READ_OPTIONS, *GRID_OPTIONS)}
-    report.notes['read_as'] = json.dumps(
-        {
-            name: value
-            for name, value in own.items()
-            if name == 'sound_speed' or value != getattr(usual, name)
-        }
-    )
+    names, usual = (*READ_OPTIONS, *GRID_OPTIONS), SegyOptions()
+    told = [n for n in names if n == 'sound_speed' or getattr(how, n) != getattr(usual, n)]
+    report.notes['read_as'] = json.dumps({name: getattr(how, name) for name in told})
 
 
 def _positions(line: SegyLine) -> list[Record]:
     """Where the line was whenever its headers say a new place."""
-    records: list[Record] = []
-    last = (np.nan, np.nan)
-    for stamp, place in zip(line.stamps, zip(line.longitude, line.latitude)):
-        if np.isfinite(place).all() and place != last:
-            records.append((stamp, '/position', write_position(stamp, *map(float, place))))
-            last = place
-    return records
+    places = zip(line.stamps, line.longitude.tolist(), line.latitude.tolist())
+    known = (each for each in places if np.isfinite(each[1:]).all())
+    new = (next(group) for _, group in groupby(known, key=itemgetter(1, 2)))
+    return [(stamp, '/position', write_position(stamp, *place)) for stamp, *place in new]
 
 
 def _instrument(
@@ -175,32 +190,6 @@ def _instrument(
         noise, sigma = 0.0, by_depth
     report.notes['pulse'] = f'of an envelope, {width:g} m; noise {described}; see parameters.yaml'
     return envelope_parameters(width, noise, window), sigma
-
-
-def _records(
-    report: ConversionReport,
-    path: Path,
-    line: SegyLine,
-    window: Window,
-    sigma: FloatArray | None,
-    how: SegyOptions,
-) -> list[Record]:
-    """Return the traces of one window, each the mean of a stack."""
-    depth, records = window.depth(line), []
-    for first in range(window.rows.start, window.rows.stop - how.stack + 1, how.stack):
-        report.rows += how.stack
-        rows = slice(first, first + how.stack)
-        stamp = line.stamps[rows.stop - 1]
-        with report.leaving_out(path, f'trace {first}'):
-            trace = Trace(
-                stamp_ns=stamp,
-                frame_id=how.frame_id,
-                depth=depth,
-                amplitude=line.amplitude[rows, window.samples].mean(axis=0),
-                sigma=sigma,
-            )
-            records.append((stamp, '/trace', write_trace(trace, ros_message)))
-    return records
 
 
 def measured_instrument(
@@ -243,3 +232,121 @@ def doubted_spacing(
         f'{np.median(stated[known]):.1f} m of water: {fits:.3g} m a sample would fit; '
         'give the sample spacing'
     )
+
+
+LONGEST_BLOCK = 2**24
+"""Samples of all channels in a block."""
+FULL_SCALE = 2**15
+_NAMED = re.compile(r'(?<!\d)(?:20)?(\d\d)(\d\d)(\d\d)[T_\-.]?(\d\d)(\d\d)(\d\d)(?!\d)')
+
+
+@converter(HydrophonesOptions)
+def convert_hydrophones(path: Path, how: HydrophonesOptions, report: ConversionReport) -> None:
+    """Convert the channels of a sound file to the topic ``/pressure``, block by block.
+
+    The bag gets ``parameters.yaml`` with the number of hydrophones.
+    """
+    places = navigation_of_table(how.nav, how.nav_options, report, on_earth=True)
+    try:
+        import soundfile
+    except ImportError:
+        raise BagError("sound needs soundfile: pip install 'sonar_imm[sound]'") from None
+    try:
+        audio = soundfile.SoundFile(str(path))
+    except (soundfile.LibsndfileError, OSError) as error:
+        raise BagError(f'{path} cannot be read as sound: {error}') from None
+    with audio:
+        channels = _channels(audio, how.channels)
+        start_ns = _start_ns(path, how)
+        if not how.start:
+            utc = np.datetime64(start_ns, 'ns').astype('datetime64[s]')
+            report.notes['start'] = f'{utc}Z by the name of the file (--start, --time-zone)'
+        rows = max(2, round(how.block * audio.samplerate))
+        if rows * audio.channels > LONGEST_BLOCK:
+            raise BagError(
+                f'blocks of {how.block:g} s have {rows * audio.channels} samples; say a shorter '
+                '--block'
+            )
+        report.notes['sound'] = (
+            f'{audio.channels} channels, {audio.samplerate} Hz, '
+            f'{audio.frames / audio.samplerate:.1f} s, {audio.subtype}'
+        )
+        if 'should be' in audio.extra_info:  # words of libsndfile
+            report.problems.append(
+                f'{path.name} is shorter than it says of itself; what is there is kept'
+            )
+        report.notes['full scale'] = f'{how.full_scale:g} Pa'
+        own = {'fathometer': {'phones': len(channels)}}
+        with new_bag(report, path.name, how, own) as bag:
+            _write_blocks(audio, bag, report, how, channels, start_ns, rows)
+            if not bag.counts:
+                raise report.nothing(path)
+            for stamp_ns, topic, message in places:
+                bag.write(topic, message, stamp_ns)
+
+
+def _write_blocks(
+    audio: soundfile.SoundFile,
+    bag: BagWriter,
+    report: ConversionReport,
+    how: HydrophonesOptions,
+    channels: list[int],
+    start_ns: int,
+    rows: int,
+) -> None:
+    source, whole, done = Path(audio.name), audio.subtype == 'PCM_16', 0
+    while True:
+        try:
+            samples = audio.read(rows, dtype='int16' if whole else 'float32', always_2d=True)
+        except RuntimeError as error:
+            report.problems.append(f'{source.name}: the rest cannot be read: {error}')
+            return
+        if len(samples) < 2:
+            return
+        report.rows += len(samples)
+        scale = how.full_scale / FULL_SCALE if whole else 0.0
+        pressure = samples[:, channels] * np.float32(scale or how.full_scale)
+        stamp_ns = start_ns + round(done * SECOND / audio.samplerate)
+        done += len(samples)
+        with report.leaving_out(source, f'{done / audio.samplerate:.1f} s'):
+            block = Pressure(
+                stamp_ns=stamp_ns,
+                frame_id=how.frame_id,
+                pressure=pressure,
+                sample_rate=float(audio.samplerate),
+                reference_depth=how.depth,
+                scale=scale,
+            )
+            bag.write('/pressure', write_pressure(block, ros_message), stamp_ns)
+
+
+def _channels(audio: soundfile.SoundFile, wanted: Sequence[int] | None) -> list[int]:
+    """The channels of the hydrophones, the deepest first."""
+    channels = list(range(audio.channels)) if wanted is None else list(wanted)
+    if wrong := [k for k in channels if not 0 <= k < audio.channels]:
+        raise BagError(f'{audio.name} has the channels 0 to {audio.channels - 1}, not {wrong[0]}')
+    if len(channels) < 2:
+        raise BagError(f'{audio.name} has one channel; an array has at least two hydrophones')
+    return channels
+
+
+def _start_ns(path: Path, how: HydrophonesOptions) -> int:
+    """When the first sample was taken, from the option or the name of the file."""
+    text = how.start
+    if not text:
+        found = _NAMED.search(path.stem)
+        if found is None:
+            raise BagError(
+                f'{path.name} does not say when it begins; say --start 2024-05-31T10:00:00Z, or '
+                '--start 0 where the time of day is of no use'
+            )
+        text = '20{}-{}-{} {}:{}:{}'.format(*found.groups())
+    if text in ('0', 'now'):
+        return SECOND if text == '0' else time.time_ns()
+    try:
+        start_ns = moment_ns(text, lambda: how.time_zone)
+    except BadRow as error:
+        raise BagError(str(error)) from None
+    if start_ns is None:
+        raise BagError(f"'{text}' is no time; write 2024-05-31T10:00:00Z")
+    return start_ns

@@ -5,24 +5,154 @@
 # writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
-"""Files of positions that are no CSV, as the tables that converters read: GPX, KML and GeoJSON."""
+
+"""Files with rows of positions and other numbers, all read as tables: CSV with any delimiter, GPX,
+KML and GeoJSON."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import codecs
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+import contextlib
 from contextlib import suppress
+import csv
 import json
 import math
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, TextIO
 from xml.etree import ElementTree
 
 import numpy as np
 
-from .csv_table import CsvTable
+from .columns import time_unit_of, unit_of
 from .sources import BagError, start_of
 from .tables import CsvOptions, Table
+
+LONGEST_LINE = 1 << 20
+"""Characters."""
+RECORDS = 'VEMCO DATA LOG'
+"""Begin of a file of records of several kinds, each with its own header, of which detections
+(``DET``) are read."""
+
+
+class CsvTable(Table):
+    """The header of a CSV file and an iterator over its rows. Raises `BagError` for no CSV."""
+
+    UNITS_ARE_FREE = True
+
+    def __init__(self, path: str | Path, options: CsvOptions | None = None):
+        self.path = Path(path)
+        self.options = options or CsvOptions()
+        self._kind = ''
+        start = start_of(self.path)
+        if start[:2] in (b'\xff\xfe', b'\xfe\xff') and b'\0' in start[:64]:
+            raise BagError(f'{self.path} is text in UTF-16; save it as UTF-8')
+        if _binary(start):
+            raise BagError(f'{self.path} is no text, not a CSV file')
+        self._encoding = _encoding(start)
+        with self._open() as file:
+            lines = (line for line in _lines(file) if line.strip() and not _is_aside(line))
+            first = next(lines, '')
+            if first.startswith(RECORDS):
+                first = next((line for line in lines if line.startswith('DET_DESC')), first)
+                self._kind = 'DET'
+            second = next(lines, '')
+        if not first:
+            raise BagError(f'{self.path} is empty, not a CSV file')
+        likely = max(',;\t|', key=first.count)
+        self.delimiter = self.options.delimiter or (likely if likely in first else ' ')
+        try:
+            headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
+        except csv.Error:
+            raise self._no_table(1) from None
+        super().__init__(path, options, headers)
+        if not self._kind:
+            with contextlib.suppress(csv.Error):
+                self.units = _units_of(next(csv.reader([second], **self._dialect), []), headers)
+
+    def _no_table(self, line: int) -> BagError:
+        return BagError(
+            f'{self.path}, line {line} is no line of a CSV file: it holds more than '
+            f'{csv.field_size_limit()} characters in a cell, or bytes that are no text'
+        )
+
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
+        ended, width, header_seen, to_skip = True, 0, False, bool(self.units)
+
+        def lines(file: TextIO) -> Iterator[str]:
+            nonlocal ended
+            for line in _lines(file):
+                ended = line.endswith(('\n', '\r'))
+                yield line
+
+        with self._open() as file:
+            reader = csv.reader(lines(file), **self._dialect)
+            while True:
+                try:
+                    cells = next(reader)
+                except StopIteration:
+                    return
+                except csv.Error:
+                    raise self._no_table(reader.line_num) from None
+                if not any(cell.strip() for cell in cells) or _is_aside(cells[0]):
+                    continue
+                if self._kind:
+                    header_seen = cells[0] == self._kind
+                if header_seen and to_skip:
+                    to_skip = False
+                elif header_seen:
+                    if len(cells) < width and not ended:
+                        self.cut_line = reader.line_num
+                    width = len(cells)
+                    yield reader.line_num, cells
+                else:
+                    header_seen = not self._kind
+
+    @property
+    def _dialect(self) -> dict[str, Any]:
+        return {'delimiter': self.delimiter, 'skipinitialspace': True}
+
+    def _open(self) -> TextIO:
+        return self.path.open(encoding=self._encoding, errors='replace', newline='')
+
+
+def _is_aside(line: str) -> bool:
+    """Whether a line is a comment, or names the delimiter, as spreadsheets write."""
+    return line.startswith('#') or re.match('sep=.?$', line.strip().lower()) is not None
+
+
+def _units_of(cells: Sequence[str], headers: Sequence[str]) -> list[str]:
+    """The units of the columns where the row below the headers holds them, else nothing. Headers
+    with a unit keep it."""
+    words = [cell.strip().strip('[]()').strip() for cell in cells]
+    known = [bool(unit_of(f'a [{word}]') or time_unit_of(f'a {word}')) for word in words]
+    if len(cells) != len(headers) or not any(known) or any(map(re.compile(r'\d').search, words)):
+        return []
+    return ['' if unit_of(header) else word for word, header in zip(words, headers)]
+
+
+def _lines(file: TextIO) -> Iterator[str]:
+    """The lines of a file; what is longer than any line of a table comes in parts."""
+    return iter(lambda: file.readline(LONGEST_LINE), '')
+
+
+def _binary(start: bytes) -> bool:
+    """Whether the first bytes are something else than text: control characters are among them, or
+    many that are no UTF-8. A byte of another alphabet here and there is text all the same."""
+    controls = sum(byte < 32 and byte not in b'\t\n\r\f\x1a' for byte in start)
+    strange = start.decode('utf-8', errors='replace').count('\ufffd')
+    return controls > 0 or 10 * strange > len(start)
+
+
+def _encoding(start: bytes) -> str:
+    """UTF-8, or else what spreadsheets of western Europe write."""
+    try:
+        codecs.getincrementaldecoder('utf-8')().decode(start)  # its end may be cut
+    except UnicodeDecodeError:
+        return 'cp1252'
+    return 'utf-8-sig'
+
 
 LARGEST_JSON = 200_000_000
 """Bytes of a GeoJSON file, which is read as a whole."""
@@ -42,12 +172,10 @@ class TrackFile(Table):
         records: Iterable[Mapping[str, str] | str],
         what: str,
     ):
-        self._records, problems = [], []
-        for record in records:
-            if isinstance(record, str):
-                problems.append(f'{Path(path).name} {record}; what came before it is kept')
-            else:
-                self._records.append(record)
+        read = list(records)
+        self._records = [each for each in read if not isinstance(each, str)]
+        words = [each for each in read if isinstance(each, str)]
+        problems = [f'{Path(path).name} {word}; what came before it is kept' for word in words]
         names = dict.fromkeys(name for record in self._records for name in record)
         if not names:
             raise BagError(' '.join([f'{path} is {what} without a position', *problems]))
@@ -75,11 +203,10 @@ def kind_of_text(path: Path) -> str:
     text = start_of(path).removeprefix(b'\xef\xbb\xbf').lstrip()
     if text.startswith(b'<'):
         return next((kind for kind in ('gpx', 'kml') if f'<{kind}'.encode() in text), '')
-    if text[:1] in (b'{', b'['):
-        head = text.replace(b' ', b'')
-        names = (b'"FeatureCollection"', b'"Feature"')
-        return 'geojson' if any(b'"type":' + name in head for name in names) else 'json'
-    return ''
+    if text[:1] not in (b'{', b'['):
+        return ''
+    is_geo = re.search(rb'"type":"Feature(Collection)?"', text.replace(b' ', b''))
+    return 'geojson' if is_geo else 'json'
 
 
 def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str] | str]:
@@ -104,7 +231,9 @@ def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str] | str]:
             if tag == 'name' and names:
                 names[-1] = names[-1] or (element.text or '').strip()
             elif tag in ('trkpt', 'rtept', 'wpt'):
-                yield _gpx_point(element, names[-1] if names else '')
+                own = _text(element, 'name') if tag == 'wpt' else (names or [''])[-1]
+                place = (element.get('lat', ''), element.get('lon', ''), _text(element, 'ele'))
+                yield dict(zip(PLACE, (_text(element, 'time'), *place, own)))
                 element.clear()
             elif tag == 'Placemark':
                 points = list(_placemark(marks.pop(), names.pop()))
@@ -136,12 +265,6 @@ def _text(element: ElementTree.Element, tag: str) -> str:
     return next(found, '').strip()
 
 
-def _gpx_point(point: ElementTree.Element, name: str) -> dict[str, str]:
-    place = (point.get('lat', ''), point.get('lon', ''), _text(point, 'ele'))
-    own = _text(point, 'name') if point.tag.endswith('wpt') else name
-    return dict(zip(PLACE, (_text(point, 'time'), *place, own)))
-
-
 def _placemark(
     placemark: ElementTree.Element, name: str, cut: bool = False
 ) -> Iterator[dict[str, str]]:
@@ -150,19 +273,15 @@ def _placemark(
     times, places = [], []
     for part in placemark.iter():
         tag, text = part.tag.rpartition('}')[2], (part.text or '').strip()
-        if tag == 'when':
-            times.append(text)
-        elif tag == 'coord':
-            places.append(text.split())
-        elif tag == 'coordinates':
-            places += [place.split(',') for place in text.split()]
+        times += [text] if tag == 'when' else []
+        places += [text.split()] if tag == 'coord' else []
+        places += [place.split(',') for place in text.split()] if tag == 'coordinates' else []
     if len(times) != len(places) and not (cut and len(times) > 1):
         times = times * len(places) if len(times) == 1 else [''] * len(places)
     for time, place in zip(times, places):
-        if len(place) < 2:
-            continue
-        longitude, latitude, *height = place
-        yield dict(zip(PLACE, (time, latitude, longitude, height[0] if height else '', name)))
+        if len(place) >= 2:
+            longitude, latitude, height = (*place, '')[:3]
+            yield dict(zip(PLACE, (time, latitude, longitude, height, name)))
 
 
 def _read_geojson(path: Path) -> Iterator[dict[str, str] | str]:
