@@ -9,26 +9,21 @@
 """Snapshots for the bathymetry tests: the independent vectors, and small floors of our own."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 
+from helpers.vector_files import load_vectors
 from sonar_imm.acoustics import array
-from sonar_imm.measurements import Navigation, Snapshot
+from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm.trackers.bathymetry.likelihood import ship_swath
-from sonar_imm.trackers.bathymetry.ping import bin_stamps
-from sonar_imm.trackers.navigation import NavigationBuffer
 
 EXACT = {'tilt_std_deg': 0.0, 'spacing_std': 0.0, 'sound_speed_std': 0.0}
 """An array and water that are known: the covariance is that of the filter."""
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry'
 
 
 def vector(name):
     """A case: its arrays, the config that describes it, its snapshot."""
-    with np.load(VECTORS / f'{name}.npz') as archive:
-        case = dict(archive)
+    case = load_vectors(f'bathymetry/{name}')
     values = {
         'sonar_height': float(case['H']), 'tilt_deg': math.degrees(case['tilt']),
         'element_spacing_wavelengths': float(case['dlam']),
@@ -43,82 +38,28 @@ def vector(name):
         values |= {'model_set': 'angle_two_rw', 'sigmas_deg': sigmas}
         values |= {'initial_mean': float(case['th0']), 'angle_drift': False}
     else:
-        values |= {
-            'model_set': 'height_rw_ncs',
-            'sigmas': [float(case['s_rw']), float(case['s_ncs'])],
-            'initial_slope_std': float(case['sb0']),
-            'redrawn_slope_std': float(case['gb']),
-        }
+        sigmas = [float(case['s_rw']), float(case['s_ncs'])]
+        values |= {'model_set': 'height_rw_ncs', 'sigmas': sigmas}
+        values |= {'initial_slope_std': float(case['sb0']), 'redrawn_slope_std': float(case['gb'])}
     noise = np.full(len(case['r']), float(case['sn2']))
-    snapshot = Snapshot(
-        stamp_ns=1_000, range=case['r'], iq=case['Y'], noise_variance=noise,
-        signal_variance=case['rho'] * noise,
-    )  # fmt: skip
+    stated = {'noise_variance': noise, 'signal_variance': case['rho'] * noise}
+    snapshot = Snapshot(stamp_ns=1_000, range=case['r'], iq=case['Y'], **stated)
     return case, BathymetryConfig(**values), snapshot
 
 
 def floor(height, *, seed=1, stamp_ns=1_000, snr_db=25.0, H=15.0, tilt_deg=30.0, P=8, **more):
     """A snapshot of a floor of `height` (T,) or a number, noise variance 1."""
     ranges = more.pop('ranges', 20.0 + 0.05 * np.arange(300))
-    height = np.broadcast_to(height, ranges.shape)
-    rng = np.random.default_rng(seed)
     spacing, conjugate = more.pop('spacing', 0.5), more.pop('conjugate', False)
-    sine = array.direction_sine(H - height, ranges, math.radians(tilt_deg))
+    rng, depth = np.random.default_rng(seed), H - np.broadcast_to(height, ranges.shape)
+    sine = array.direction_sine(depth, ranges, math.radians(tilt_deg))
 
     def circular(*shape):
         return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) * math.sqrt(0.5)
 
-    y = (
-        10.0 ** (snr_db / 20.0)
-        * circular(len(ranges), 1)
-        * array.steering(sine, P, spacing, conjugate=conjugate)
-    )
+    y = 10.0 ** (snr_db / 20.0) * circular(len(ranges), 1)
+    y = y * array.steering(sine, P, spacing, conjugate=conjugate)
     y = (y + circular(len(ranges), P)) * np.sqrt(rng.exponential(size=(len(ranges), 1)))
     y[more.pop('shadow', slice(0, 0))] = circular(1, P)
     more.setdefault('noise_variance', np.ones(len(ranges)))
     return Snapshot(stamp_ns=stamp_ns, range=ranges, iq=y.astype(np.complex64), **more)
-
-
-# -- the recording of a moving ship among the vectors --
-
-START_NS = 10**18
-
-
-def motion_case():
-    with np.load(VECTORS.parent / 'bathymetry_sea' / 'motion_0.npz') as archive:
-        return dict(archive)
-
-
-def sea_config(case, **values):
-    stated = {
-        'sonar_lever': case['lever'].tolist(), 'sonar_mount_rpy_deg': case['mount_deg'].tolist(),
-        'tilt_deg': float(case['tilt_deg']), 'side': str(case['side']),
-    }  # fmt: skip
-    return BathymetryConfig(**{**EXACT, **stated, **values})
-
-
-def navigation(case):
-    return [
-        Navigation(stamp_ns=START_NS + round(t * 1e9), position=p, orientation=q, frame_id='map')
-        for t, p, q in zip(case['tn'], case['pn'], case['qn'])
-    ]
-
-
-def snapshots(case):
-    for t, parts in zip(case['t'], case['iq'].astype(np.float64)):
-        yield Snapshot(
-            stamp_ns=START_NS + round(t * 1e9), frame_id='sonar', range=case['r'],
-            iq=parts[..., 0] + 1j * parts[..., 1], sound_speed=float(case['c']),
-            noise_variance=np.full(len(case['r']), float(case['sn2'])),
-        )  # fmt: skip
-
-
-def swath_of(case, config, snapshot):
-    """The swath of one ping."""
-    poses = navigation(case)
-    buffer = NavigationBuffer(tuple(each.stamp_ns for each in poses), tuple(poses))
-    stamps = bin_stamps(snapshot, config)
-    ranges = snapshot.ranges(config.sound_speed)
-    return ship_swath(
-        config, ranges, float(case['c']), config.side, float(case['dlam']), buffer.poses(stamps)
-    )

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Helpers of the obstacle tests: recorded approaches as measurements, runs, errors."""
+"""Helpers of the obstacle tests: recorded approaches and encounters as measurements, runs."""
 
 import functools
 import json
@@ -14,11 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from helpers.vector_files import load_vectors
+from sonar_imm.acoustics.geometry import Pose, rotation
 from sonar_imm.measurements import Altitude, Detections, Navigation
-from sonar_imm.trackers.navigation import NavigationBuffer
-from sonar_imm.trackers.obstacle.filters import build_filter, Sonar
-from sonar_imm.trackers.obstacle.mixtures import innovations
-from sonar_imm.trackers.obstacle.pings import Echoes, Mount
+from sonar_imm.trackers.obstacle.filters import Sonar
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
@@ -30,12 +29,34 @@ EXACT = {'drift_std': 0.0, 'yaw_error_std_deg': 0.0, 'navigation_delay_std': 0.0
 FIXED = {'behaviours': ('fixed',), **EXACT}
 AS_STATED = {'variance_scale_min': 1.0, 'variance_scale_max': 1.0}
 """Variances as detections state them: what is wrong shows in the innovations."""
+NO_NOISE = {'scale_std': 0.0, 'navigation_noise': (0.0, 0.0, 0.0)}
 FAITHFUL = {
-    **FIXED, **AS_STATED, 'components': 41, 'max_offset': 12.0, 'scale_std': 0.0,
-    'navigation_noise': (0.0, 0.0, 0.0), 'clutter_density': 1e-9, 'gate_probability': 0.9999999,
-    'max_tracks': 1, 'confirm_hits': 1,
+    **FIXED, **AS_STATED, **NO_NOISE, 'components': 41, 'max_offset': 12.0,
+    'clutter_density': 1e-9, 'gate_probability': 0.9999999, 'max_tracks': 1, 'confirm_hits': 1,
 }  # fmt: skip
 """A tracker that does what the exact posterior of the vectors does."""
+KINDS = ('fixed', 'swaying', 'moving', 'seabed')
+ENCOUNTERS = (
+    ('swaying_approach', 0), ('moving_target', 0), ('starts_moving', 0), ('seabed_and_fixed', 0),
+    ('seabed_and_fixed', 1),
+)  # fmt: skip
+"""Encounters at sea with the answers of an independent filter."""
+
+
+def level(north=0.0, altitude=np.nan, turned=(0.0, 0.0, 0.0)):
+    """A sonar 20 m deep, bow to the north unless it is turned."""
+    return Sonar(Pose(np.array([north, 0.0, 20.0]), rotation(*turned)), altitude)
+
+
+def still(stamp_ns, x=0.0, orientation=(0.0, 0.0, 0.0, 1.0)):
+    """Navigation of a level vehicle 20 m deep, bow to the east."""
+    return Navigation(stamp_ns=stamp_ns, position=[x, 0.0, -20.0], orientation=orientation)
+
+
+def echoes(stamp_ns, z=(), **more):
+    """A ping of echoes z (n, 2)."""
+    z = np.reshape(np.asarray(z, float), (-1, 2))
+    return Detections(stamp_ns=stamp_ns, range=z[:, 0], bearing=z[:, 1], **more)
 
 
 @functools.cache
@@ -48,29 +69,24 @@ def rows(name):
     return np.genfromtxt(VECTORS / f'{name}.csv', delimiter=',', names=True)
 
 
-def navigation(row, stamp_ns):
-    return Navigation(
-        stamp_ns=stamp_ns, position=[row['odom_x'], row['odom_y'], row['odom_z']],
-        orientation=[row['qx'], row['qy'], row['qz'], row['qw']], frame_id='odom',
-    )  # fmt: skip
-
-
 def approach(name):
     """The measurements of a vector file, ROS axes."""
     out = []
     for row in rows(name):
         stamp = SECOND + round(row['t'] * SECOND)
-        seen = np.isfinite(row['meas_range'])
-        out.append(Altitude(stamp_ns=stamp, altitude=row['altitude']))
-        out.append(navigation(row, stamp))
-        out.append(
-            Detections(
-                stamp_ns=stamp,
-                range=[row['meas_range']] if seen else [],
-                bearing=[-row['meas_delta']] if seen else [],
-            )
+        position, turn = (
+            [row[key] for key in keys.split()] for keys in ('odom_x odom_y odom_z', 'qx qy qz qw')
         )
+        out += [
+            Altitude(stamp_ns=stamp, altitude=row['altitude']),
+            Navigation(stamp_ns=stamp, position=position, orientation=turn, frame_id='odom'),
+            echoes(stamp, seen_of(row['meas_range'], -row['meas_delta'])),
+        ]
     return out
+
+
+def seen_of(distance, bearing):
+    return [(distance, bearing)] if np.isfinite(distance) else []
 
 
 def lever(name):
@@ -87,10 +103,13 @@ def run(tracker, measurements):
     return dict(sorted(final.items()))
 
 
+def track(measurements, **values):
+    """The estimates ping by ping."""
+    return list(run(ObstacleTracker(ObstacleConfig(**values)), measurements).values())
+
+
 def track_approach(name, **values):
-    """The estimates of a vector file, ping by ping."""
-    config = ObstacleConfig(sonar_lever=lever(name), **values)
-    return list(run(ObstacleTracker(config), approach(name)).values())
+    return track(approach(name), sonar_lever=lever(name), **values)
 
 
 def track_scene(name, seed, overrides=None, **values):
@@ -101,18 +120,11 @@ def track_scene(name, seed, overrides=None, **values):
 def tracked(name, seed, overrides=None, **values):
     """A simulated scene, the estimates of it by stamp, and the tracker, with parameters `values`
     beside those that the scene has."""
-    scene_config = scenario(name, overrides)
-    scene = simulate(scene_config, seed)
-    config = ObstacleConfig(
-        **{
-            'sonar_lever': scene_config.sonar_lever,
-            'sonar_mount_rpy_deg': scene_config.sonar_mount_rpy_deg,
-            'azimuth_model': scene_config.azimuth_model,
-            'ping_timing': scene_config.ping_timing,
-            **values,
-        }
-    )
-    tracker = ObstacleTracker(config)
+    config = scenario(name, overrides)
+    scene = simulate(config, seed)
+    shared = ('sonar_lever', 'sonar_mount_rpy_deg', 'azimuth_model', 'ping_timing')
+    values = {**{key: getattr(config, key) for key in shared}, **values}
+    tracker = ObstacleTracker(ObstacleConfig(**values))
     return scene, run(tracker, [item.measurement for item in scene.measurements]), tracker
 
 
@@ -120,10 +132,7 @@ def followed(estimate, truth, ping, near=5.0):
     """The row of the confirmed track that follows `truth` at number `ping`, None when there is
     none."""
     r, b = estimate.state[:, 0], estimate.state[:, 1]
-    true_r, true_b = truth.range[ping], truth.bearing[ping]
-    distance = np.hypot(
-        r * np.cos(b) - true_r * np.cos(true_b), r * np.sin(b) - true_r * np.sin(true_b)
-    )
+    distance = np.abs(r * np.exp(1j * b) - truth.range[ping] * np.exp(1j * truth.bearing[ping]))
     good = (estimate.extras['track_state'] > 0) & (distance < near)
     return int(np.argmin(np.where(good, distance, np.inf))) if good.any() else None
 
@@ -138,71 +147,42 @@ def offset_at(scene, final, at_range):
         if row is not None:
             true = truth.vertical_offset[ping]
             low, high = (estimate.extras[f'vertical_offset_{end}'][row] for end in ('lo', 'hi'))
-            return (
-                estimate.state[row, 2] - true,
-                estimate.covariance[row, 2, 2],
-                low <= true <= high,
-                estimate.probabilities[row, 0],
-            )
+            error, variance = estimate.state[row, 2] - true, estimate.covariance[row, 2, 2]
+            return error, variance, low <= true <= high, estimate.probabilities[row, 0]
     return None
 
 
-def mean_nis(final):
-    """Mean normalised innovation squared over all hits; 2 when all is right."""
-    values = np.concatenate([estimate.extras['nis'] for estimate in final.values()])
-    return float(np.nanmean(values))
+@functools.cache
+def met(name, number=0, altitude=True, **values):
+    """The arrays of a recorded encounter by key, and the estimates of it ping by ping."""
+    head, found = f'{number:02d}/', load_vectors(f'obstacle_sea/{name}')
+    data = {key[len(head) :]: value for key, value in found.items() if key.startswith(head)}
+    return data, track_encounter(data, altitude, **values)
 
 
-def follow(measurements, config):
-    """A vector file's obstacle without gate or track logic: NIS (n,) of each echo, and the last
-    view."""
-    mount = Mount(config)
-    filter_, mixture, before, nis = build_filter(config), None, None, []
-    for i in range(0, len(measurements), 3):
-        altitude, pose, ping = measurements[i : i + 3]
-        sonar = Sonar(
-            mount.sonar(NavigationBuffer().added(pose).pose(pose.stamp_ns)), altitude.altitude
-        )
-        echoes = Echoes.of(ping, config)
-        z, R = echoes.z, echoes.R
-        if mixture is None:
-            mixture = filter_.begin(z, R, sonar)
-        else:
-            mixture, _ = filter_.advance(mixture, before, sonar, 0.5)
-            if len(z):
-                h, C = filter_.expected(mixture, sonar)
-                nis.append(innovations(mixture.mu, z[:, None] - h, C + R[:, None])[2][0])
-                mixture = filter_.update(mixture, h, z, R, sonar)[0]
-        before = sonar
-    return np.array(nis), filter_.view(mixture, sonar)
+def track_encounter(data, altitude=True, **values):
+    given = []
+    for k, t in enumerate(data['t']):
+        stamp = SECOND + round(float(t) * SECOND)
+        if altitude:
+            given.append(Altitude(stamp_ns=stamp, altitude=float(data['altitude'][k])))
+        pose, turn, velocity, rate = (data[f'odom_{key}'][k].astype(float) for key in 'pqvw')
+        moving = {'velocity': velocity, 'turn_rate': rate, 'frame_id': 'odom'}
+        given.append(Navigation(stamp_ns=stamp, position=pose, orientation=turn, **moving))
+        given.append(echoes(stamp, seen_of(data['meas_range'][k], data['meas_bearing'][k])))
+    lever = tuple(float(value) for value in data['sonar_lever_flu'])
+    return track(given, sonar_lever=lever, **{**AS_STATED, **values})
 
 
-def crossing(pings=80, detected=1.0, clutter=0.0, late=10**6):
-    """The estimates ping by ping, and the true velocities (3, 2), east and north. Every echo comes
-    with the probability `detected`, among `clutter` false ones a ping on average; the third
-    obstacle echoes from ping `late` on and does not move."""
-    rng = np.random.default_rng(3)
-    velocity = np.array([[0.0, 0.5], [0.0, -0.5], [0.0, 0.0]])
-    start = np.array([[70.0, -10.0], [72.0, 10.0], [84.0, 12.0]])
-    measurements = []
-    for k in range(pings):
-        t, stamp = 0.5 * k, SECOND + k * SECOND // 2
-        measurements.append(
-            Navigation(stamp_ns=stamp, position=[t, 0.0, -20.0], orientation=[0.0, 0.0, 0.0, 1.0])
-        )
-        off = start + t * velocity - [t, 0.0]
-        z = np.column_stack([np.hypot(*off.T), np.arctan2(off[:, 1], off[:, 0])])
-        z[:2] += rng.normal(size=(2, 2)) * [0.1, 0.003]
-        echoes = [z[0], z[1]]
-        if detected < 1.0 or k >= late:
-            z[2] += rng.normal(size=2) * [0.1, 0.003]
-            echoes = [item for item in z[: 3 if k >= late else 2] if rng.uniform() < detected]
-            echoes += [
-                rng.uniform([5.0, -0.39], [99.0, 0.39]) for _ in range(rng.poisson(clutter))
-            ]
-        seen = np.reshape(echoes, (-1, 2))
-        measurements.append(Detections(stamp_ns=stamp, range=seen[:, 0], bearing=seen[:, 1]))
-    return list(run(ObstacleTracker(ObstacleConfig()), measurements).values()), velocity
+def oldest(estimate):
+    """The columns of the only, or the longest, track."""
+    row = int(np.argmin(estimate.extras['track_id']))
+    return {name: values[row] for name, values in estimate.columns().items()}
+
+
+def column(estimates, name, pings):
+    """(n,) of the oldest track."""
+    return np.array([oldest(estimates[k])[name] for k in pings])
 
 
 def tracked_by_command(folder, scenario='tethers', seed=1, **settings):

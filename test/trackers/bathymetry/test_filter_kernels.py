@@ -6,10 +6,13 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The particle filter of a ping: bits of its verbs in numpy, which meet closed forms."""
+"""The particle filter of a ping: bits of its verbs in numpy, which meet closed forms. The whole:
+exact answers, computed independently."""
 
 from types import SimpleNamespace
 
+from attrs import evolve
+from helpers.bathymetry_cases import vector
 from helpers.vector_files import load_vectors
 import numpy as np
 from oracles import bin_likelihood
@@ -22,6 +25,7 @@ from sonar_imm.acoustics.laplace import likelihood_table
 from sonar_imm.trackers.bathymetry import bins, ping
 from sonar_imm.trackers.bathymetry.filter_kernels import normals
 from sonar_imm.trackers.bathymetry.likelihood import level_geometry
+from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
 
 ASYMMETRIC = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
 M, N, P = 3, 50, 5
@@ -52,30 +56,25 @@ def make_case(
         parts = interference.interference_form(iq, R)
         base, form, spread = parts.base, -signal[:, None] * parts.beam, parts.spread
     tilt = rng.uniform(0.3, 0.6, T)
-    geometry = level_geometry(ranges, 15.0, 0.5, 0.5, of_heights=heights)._replace(
-        height=rng.normal(15.0, 0.3, T), tilt=tilt, cos_tilt=np.cos(tilt), sin_tilt=np.sin(tilt),
-        drift_from=1,
-    )  # fmt: skip
+    turned = {'tilt': tilt, 'cos_tilt': np.cos(tilt), 'sin_tilt': np.sin(tilt)}
+    geometry = level_geometry(ranges, 15.0, 0.5, 0.5, of_heights=heights)
+    geometry = geometry._replace(height=rng.normal(15.0, 0.3, T), drift_from=1, **turned)
     if bent:
         profile = rays.profile_of([0.0, 1520.0, 8.0, 1500.0, 20.0, 1490.0])
         table = rays.launch_table(profile, 5.0, ranges[-1], 1500.0)
-        geometry = geometry._replace(
-            launch=table.value,
-            row=ranges / table.range_step,
-            first_depth=table.first_depth,
-            depth_step=table.depth_step,
-        )
+        depths = {'first_depth': table.first_depth, 'depth_step': table.depth_step}
+        row = ranges / table.range_step
+        geometry = geometry._replace(launch=table.value, row=row, **depths)
     arrays = (np.ascontiguousarray(part) for part in (form, base, spread, signal))
     likelihood = bins.PingLikelihood(
         ranges, np.array(echo), *arrays, ones, np.zeros(T), likelihood_table(P), geometry
     )
     models = SimpleNamespace(
-        F=np.eye(2) + 0.1 * rng.normal(size=(M, 2, 2)),
+        F=np.eye(2) + 0.1 * rng.normal(size=(M, 2, 2)), coast=1,
         G=0.1 * rng.normal(size=(M, 2, 2)) * np.array([[1.0, 0.0], [1.0, 1.0]]),
         scale=rng.uniform(0.5, 2.0, (T, M)),
-        coast=1,
         favour=rng.uniform(0.2, 2.0, (T, M)) if favours else np.empty((0, M)),
-    )
+    )  # fmt: skip
     return SimpleNamespace(
         start=bins.Particles(x, w, probability if mu is None else mu), models=models,
         chains=np.stack([ASYMMETRIC if mu is None else np.eye(M), np.eye(M)][: 1 + again]),
@@ -85,11 +84,8 @@ def make_case(
 
 def compiled(case):
     """Mean, covariance, probability, log likelihood and sample size of each bin; the particles."""
-    state = bins.Particles(*(part.copy() for part in case.start))
-    T = len(case.noise)
-    track = bins.Track(
-        np.empty((T, 2)), np.empty((T, 2, 2)), np.empty((T, M)), np.empty(T), np.empty(T)
-    )
+    state, T = bins.Particles(*(part.copy() for part in case.start)), len(case.noise)
+    track = bins.Track(*(np.empty((T, *shape)) for shape in ((2,), (2, 2), (M,), (), ())))
     for part in (slice(0, T // 2), slice(T // 2, T)):  # a ping is filtered block by block
         drawn = case.uniform[part], case.noise[part]
         ping.filter_bins(part.start, state, case.models, case.chains, *drawn, case.ping, track)
@@ -112,27 +108,24 @@ def in_numpy(case):
     return [*(np.array(column) for column in zip(*answers)), x, w]
 
 
+def same_bits(case):
+    found = compiled(case)
+    for a, b in zip(found, in_numpy(case)):
+        assert np.array_equal(a, b)
+    return found
+
+
 @pytest.mark.parametrize(
     'options',
-    [
-        {},
-        {'bent': True},
-        {'beside': True},
-        {'favours': True},
-        {'again': True},
-        {'heights': False},
-        {'heights': False, 'beside': True, 'favours': True, 'again': True},
-        {'bent': True, 'beside': True},
-    ],
-    ids=lambda options: ' '.join(options) or 'plain',
+    ['', 'bent again', 'bent beside', 'favours', 'angles', 'angles beside favours again'],
 )
 def test_the_kernel_gives_the_bits_of_the_verbs_in_numpy(options):
-    for seed in range(2):
-        echo = np.random.default_rng(seed).random(9) < 0.8
-        echo[1:3] = False, True
-        case = make_case(echo, seed=seed, **options)
-        for found, expected in zip(compiled(case), in_numpy(case)):
-            assert np.isfinite(found).all() and np.array_equal(found, expected)
+    values = dict.fromkeys(options.split(), True)
+    echo = np.random.default_rng(1).random(9) < 0.8
+    echo[1:3] = False, True
+    heights = not values.pop('angles', False)
+    for found in same_bits(make_case(echo, seed=1, heights=heights, **values)):
+        assert np.isfinite(found).all()
 
 
 def test_bins_that_cannot_be_explained_leave_the_prediction():
@@ -140,10 +133,7 @@ def test_bins_that_cannot_be_explained_leave_the_prediction():
     case.ping.geometry.height[2] = 1e3  # nothing is that far
     case.ping.form[4] *= np.nan
     case.start.x[0, 0, :7] = 1e3  # nor are these particles
-    found, expected = compiled(case), in_numpy(case)
-    assert np.isneginf(found[3][2])
-    for a, b in zip(found, expected):
-        assert np.array_equal(a, b)
+    assert np.isneginf(same_bits(case)[3][2])
 
 
 @pytest.mark.parametrize('value', [np.nan, np.inf])
@@ -153,13 +143,11 @@ def test_resampling_weights_that_are_not_finite_stays_in_its_arrays(value, monke
     case.models.F[:], case.models.G[:] = np.eye(2), 0.0
     guarded, kernel = np.full(N + 1 + 8, -7), ping.filter_block
 
-    def filter_block(*arguments):
-        numbers = [
-            getattr(each, 'dtype', None) == np.int64 and each.ndim == 1 for each in arguments
-        ]
+    def filter_block(*given):
+        numbers = [getattr(each, 'dtype', None) == np.int64 and each.ndim == 1 for each in given]
         assert sum(numbers) == 1
-        places = zip(arguments, numbers)
-        kernel(*(guarded[: N + 1] if origin else each for each, origin in places))
+        k = numbers.index(True)
+        kernel(*given[:k], guarded[: N + 1], *given[k + 1 :])
 
     monkeypatch.setattr(ping, 'filter_block', filter_block)
     x = compiled(case)[-2]
@@ -170,15 +158,13 @@ def test_resampling_weights_that_are_not_finite_stays_in_its_arrays(value, monke
 def test_resampling_draws_from_the_exact_mixture():
     rng = np.random.default_rng(3)
     x, w, mu = random_set(rng, n=1)
-    runs = np.stack(
-        [oracle.resample(x, w, mu, ASYMMETRIC, rng.random(3))[0].mean(axis=2) for _ in range(4000)]
-    )
-    own = (w[:, None] * x).sum(axis=2)
+    drawn = [oracle.resample(x, w, mu, ASYMMETRIC, rng.random(3)) for _ in range(4000)]
+    runs = np.stack([mixed.mean(axis=2) for mixed, _ in drawn])
     c = mu @ ASYMMETRIC
-    expected = (ASYMMETRIC * mu[:, None]).T @ own / c[:, None]
+    expected = (ASYMMETRIC * mu[:, None]).T @ (w[:, None] * x).sum(axis=2) / c[:, None]
     error = runs.std(axis=0) / np.sqrt(len(runs))
     assert (np.abs(runs.mean(axis=0) - expected) < 4.5 * error).all()
-    assert oracle.resample(x, w, mu, ASYMMETRIC, rng.random(3))[1] == pytest.approx(c)
+    assert drawn[0][1] == pytest.approx(c)
 
 
 @pytest.mark.parametrize('tiny', [5e-324, 1e-310, 1e-300, 1e-280])
@@ -186,30 +172,32 @@ def test_a_model_that_hardly_anything_can_become_stays_finite(tiny):
     """The reciprocal of its probability overflows, and numbers particles outside of the set."""
     rng = np.random.default_rng(4)
     x, w, _ = random_set(rng)
-    mu, uniform = np.array([0.4, 0.6, tiny]), rng.random(3)
-    mixed, c = oracle.resample(x, w, mu, np.eye(3), uniform)
+    mu = np.array([0.4, 0.6, tiny])
+    mixed, c = oracle.resample(x, w, mu, np.eye(3), rng.random(3))
     assert c[2] == tiny
     # Copies of particles that were there: of the model's own, or of any model's.
     assert np.isin(mixed[2, 0], x[2 if tiny > 1e-290 else slice(None), 0]).all()
-    case = make_case([True], mu=mu)
-    for found, expected in zip(compiled(case), in_numpy(case)):
-        assert np.array_equal(found, expected)
+    same_bits(make_case([True], mu=mu))
 
 
-def test_exponentials_are_those_of_the_library():
+def test_exponentials_phasors_and_normals_are_those_of_the_library():
     values = np.concatenate([-np.logspace(-18, np.log10(699.0), 20_001), np.linspace(-2, 0, 9999)])
     exact = np.exp(values)
     assert (np.abs(exponentials(values) - exact) <= 4e-16 * exact).all()
     nothing = np.array([-np.inf, np.nan, -701.0, -1e300])
     assert (exponentials(nothing) == 0.0).all() and exponentials(np.zeros(1)) == 1.0
 
-
-def test_phasors_are_cosines_and_sines():
     values = np.append(np.linspace(-60.0, 60.0, 4001), np.nan)
-    cosine, sine = phasors(values, 0.7)
-    assert np.abs(cosine - np.cos(1.4 * np.pi * values))[:-1].max() < 1e-13
-    assert np.abs(sine - np.sin(1.4 * np.pi * values))[:-1].max() < 1e-13
-    assert np.isnan(cosine[-1]) and np.isnan(sine[-1])
+    for found, exact in zip(phasors(values, 0.7), (np.cos, np.sin)):
+        assert np.abs(found - exact(1.4 * np.pi * values))[:-1].max() < 1e-13
+        assert np.isnan(found[-1])
+
+    uniform, out = np.random.default_rng(1).random(10_000), np.empty(10_000)
+    uniform[:3] = 0.0, 1.0 - 2.0**-53, 0.5
+    radius, angle = np.sqrt(-2.0 * np.log1p(-uniform[:5000])), 2.0 * np.pi * uniform[5000:]
+    normals(uniform, uniform.view(np.int64), out, out.view(np.int64))
+    assert np.abs(out[:5000] - radius * np.cos(angle)).max() < 1e-13
+    assert np.abs(out[5000:] - radius * np.sin(angle)).max() < 1e-13
 
 
 def test_all_sequences_of_models_are_summed_over():
@@ -237,12 +225,41 @@ def test_all_sequences_of_models_are_summed_over():
     assert deviation[:9, 2].max() < 0.02 and deviation[:, 0].max() < 0.01
 
 
-def test_normals_are_those_of_box_and_muller():
-    uniform = np.random.default_rng(1).random(10_000)
-    uniform[:3] = 0.0, 1.0 - 2.0**-53, 0.5
-    radius = np.sqrt(-2.0 * np.log1p(-uniform[:5000]))
-    angle = 2.0 * np.pi * uniform[5000:]
-    exact = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
-    out = np.empty(10_000)
-    normals(uniform, uniform.view(np.int64), out, out.view(np.int64))
-    assert np.abs(out - exact).max() < 1e-13
+def errors(name, **values):
+    """An exact case and the estimate of it; abs(dm) / sd and abs(dmu), each (T,)."""
+    case, config, snapshot = vector(name)
+    (found,) = BathymetryTracker(evolve(config, **values)).process(snapshot)
+    deviation = np.abs(found.state[:, 0] - case['m']) / np.sqrt(case['v'])
+    return case, found, deviation, np.abs(found.probabilities - case['mu']).max(axis=1)
+
+
+@pytest.mark.parametrize('name', ['ii_0', 'ii_1', 'iii_0', 'iii_1', 'i_corr_0', 'i_corr_1'])
+def test_particles_are_the_exact_filter_within_monte_carlo_error(name):
+    case, found, deviation, dmu = errors(f'set_{name}')
+    assert deviation.mean() <= 0.035 and dmu.mean() <= 0.006
+    assert np.abs(found.covariance[:, 0, 0] / case['v'] - 1.0).mean() < 0.06
+    if 'slope' in case:
+        slope_sd = np.sqrt(found.covariance[:, 1, 1])
+        assert (np.abs(found.state[:, 1] - case['slope']) / slope_sd).mean() < 0.06
+
+
+@pytest.mark.parametrize('name', ['set_ii_0', 'set_iii_1'])
+def test_error_falls_with_the_root_of_the_number_of_particles(name):
+    few, many = (errors(name, particles_per_model=N)[2].mean() for N in (300, 4800))
+    assert 2.8 < few / many < 5.7
+
+
+@pytest.mark.parametrize('name', ['set_ii_0', 'set_ii_1'])
+def test_gaussians_in_place_of_two_walks_are_near(name):
+    """A walk of 1 cm next to one of half a metre: what mixes is no Gaussian."""
+    *_, deviation, dmu = errors(name, engine='gaussian')
+    assert deviation.mean() < 0.2 and dmu.mean() < 0.015
+
+
+@pytest.mark.parametrize('engine, tolerance', [('gaussian', 0.08), ('particles', 0.02)])
+def test_log_likelihood_of_each_bin(engine, tolerance):
+    """The reference leaves out what does not depend on the direction; so do differences."""
+    case, found, *_ = errors('set_ii_0', engine=engine)
+    constant = np.log(2.0) - 8.0 * np.log(np.pi) - np.log1p(8.0 * case['rho'])
+    error = found.extras['log_likelihood'] - constant - case['lev']
+    assert np.abs(error).mean() < tolerance

@@ -9,41 +9,25 @@
 """Obstacles in clutter: density, existence, seeds, scales; and what misses say of the height."""
 
 from attrs import evolve
-from helpers.obstacle_runs import followed, SECOND, tracked
+from helpers.obstacle_runs import echoes, EXACT, followed, level, NO_NOISE, SECOND, tracked
 from helpers.vector_files import load_vectors
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import multivariate_normal, norm
 
-from sonar_imm.acoustics import geometry
-from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.measurements import Detections
+from sonar_imm.trackers.obstacle import births, existence
 from sonar_imm.trackers.obstacle.beam import MissEvidence
-from sonar_imm.trackers.obstacle.births import (
-    add_seeds,
-    association_ratios,
-    BEHAVIOURS,
-    level_places,
-    Seeds,
-    with_miss,
-)
 from sonar_imm.trackers.obstacle.clutter import Clutter
-from sonar_imm.trackers.obstacle.existence import (
-    detection,
-    Existence,
-    MERGED,
-    older_nearby,
-    PRIOR,
-    SUREST,
-)
-from sonar_imm.trackers.obstacle.filters import DepthSlices, DOUBT, EDGE, Mixture, SOFT, Sonar
+from sonar_imm.trackers.obstacle.existence import Existence, PRIOR
+from sonar_imm.trackers.obstacle.filters import DepthSlices, DOUBT, EDGE, Mixture, SOFT
 from sonar_imm.trackers.obstacle.ground import GroundMap
 from sonar_imm.trackers.obstacle.mixtures import Beam, PARTS, visible
 from sonar_imm.trackers.obstacle.pings import Echoes, Ping
 from sonar_imm.trackers.obstacle.scales import Scales
-from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
-from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig
+from sonar_imm_tools.simulation.obstacle.simulator import TrueObstacle
 
 CONFIG = ObstacleConfig()
 LEVER = (2.0, 0.0, -0.3)
@@ -52,27 +36,21 @@ LEVER = (2.0, 0.0, -0.3)
 def after_pings(z, ping, false):
     clutter = Clutter.none()
     for k in range(int(ping.max()) + 1):
-        which = ping == k
-        clutter = clutter.after(z[which], np.full(which.sum(), false), 0.5)
+        own = z[ping == k]
+        clutter = clutter.after(own, np.full(len(own), false), 0.5)
     return clutter
 
 
-def test_the_density_is_that_of_the_nearest_false_echoes():
-    v = load_vectors('obstacle_in_clutter/clutter')
+def test_the_density_is_that_of_the_nearest_false_echoes_and_before_them_a_prior():
+    v, quiet, one = load_vectors('obstacle_in_clutter/clutter'), Clutter.none(), np.ones((1, 2))
     clutter = after_pings(v['rows'], v['ping'], float(v['weight']))
     assert_allclose(clutter.density(v['query'], CONFIG), v['density'], rtol=1e-9)
     assert clutter.interval == 0.5
-    believed = evolve(CONFIG, clutter_density=0.3)
-    assert clutter.density(np.ones((2, 2)), believed).tolist() == [0.3, 0.3]
-
-
-def test_before_there_are_false_echoes_the_density_is_a_prior():
-    z = np.array([[50.0, 0.1]])
-    assert_allclose(Clutter.none().density(z, CONFIG), 0.02)
-    quiet = Clutter.none()
+    assert clutter.density(one, evolve(CONFIG, clutter_density=0.3)).tolist() == [0.3]
+    assert_allclose(quiet.density(one * [50.0, 0.1], CONFIG), 0.02)
     for _ in range(60):
         quiet = quiet.after(np.empty((0, 2)), np.empty(0), 0.5)
-    assert_allclose(quiet.density(z, CONFIG), 0.02 * 5.0 / 65.0)
+    assert_allclose(quiet.density(one * [50.0, 0.1], CONFIG), 0.02 * 5.0 / 65.0)
     assert quiet.a_ping() == 0.0
 
 
@@ -86,25 +64,22 @@ def test_before_there_are_false_echoes_the_density_is_a_prior():
     ],
 )
 def test_users_are_told_where_false_echoes_are(near, far, left, right, where):
-    rng = np.random.default_rng(1)
-    ping = np.repeat(np.arange(60), 12)
-    z = np.column_stack(
-        [rng.uniform(near, far, len(ping)), np.radians(rng.uniform(left, right, len(ping)))]
-    )
-    (sentence,) = after_pings(z, ping, 1.0).warnings(CONFIG)
-    assert sentence == f'12 false detections a ping, most of them {where}: learnt'
-    assert not after_pings(z, ping, 0.3).warnings(CONFIG)
-    assert not after_pings(z, ping, 1.0).warnings(evolve(CONFIG, clutter_density=0.1))
+    rng, ping = np.random.default_rng(1), np.repeat(np.arange(60), 12)
+    z = rng.uniform([near, np.radians(left)], [far, np.radians(right)], (len(ping), 2))
+    clutter = after_pings(z, ping, 1.0)
+    said = [f'12 false detections a ping, most of them {where}: learnt']
+    assert clutter.warnings(CONFIG) == said and not after_pings(z, ping, 0.3).warnings(CONFIG)
+    assert not clutter.warnings(evolve(CONFIG, clutter_density=0.1))
 
 
 def test_detections_from_where_the_sonar_is_said_not_to_look_are_said():
-    z = np.column_stack([np.full(60, 40.0), np.radians(30.0) * np.ones(60)])
-    clutter = after_pings(z, np.arange(60), 0.0)
+    clutter = after_pings(np.full((60, 2), [40.0, np.radians(30.0)]), np.arange(60), 0.0)
     (sentence,) = clutter.warnings(CONFIG)
     assert 'from beyond horizontal_fov_deg (45 deg): set it to 60 deg or more' in sentence
     assert clutter.widest(np.array([[70.0, -0.6]])) == (0.6, 70.0)
-    assert not clutter.warnings(evolve(CONFIG, horizontal_fov_deg=60.0))
-    (sentence,) = clutter.warnings(evolve(CONFIG, horizontal_fov_deg=60.0, max_range=30.0))
+    wide = evolve(CONFIG, horizontal_fov_deg=60.0)
+    assert not clutter.warnings(wide)
+    (sentence,) = clutter.warnings(evolve(wide, max_range=30.0))
     assert 'beyond max_range (30 m): set it to 40 m or more' in sentence
 
 
@@ -114,20 +89,20 @@ def of_all_parts(*V):
 
 
 def test_existence_by_class():
-    p = detection(np.array([10.0, 60.0]), evolve(CONFIG, detection_profile=(20.0, 1.0, 40.0, 0.5)))
-    assert_allclose(p, [[0.9, 0.5, 0.2], [0.45, 0.25, 0.1]])
-    q = Existence.of(np.array([[0.1, 0.2, 0.6], 0.9999999 * PRIOR]), 2)
+    falling = evolve(CONFIG, detection_profile=(20.0, 1.0, 40.0, 0.5))
+    p = existence.detection(np.array([10.0, 30.0, 60.0]), falling)
+    assert_allclose(p, np.outer([1.0, 0.75, 0.5], [0.9, 0.5, 0.2]))
+    share = np.array([0.1, 0.2, 0.6])
+    q = Existence.of(np.array([share, 0.9999999 * PRIOR]), 2)
     assert_allclose(q.probability(), [0.9, 0.9999999])
     assert_allclose(q.detectability(CONFIG)[0], (0.09 + 0.1 + 0.12) / 0.9)
     later = q.later(100.0)
     assert_allclose(later.probability(), q.probability())
-    assert_allclose(
-        later.classes[0], np.array([0.1, 0.2, 0.6]) / np.e + 0.9 * (1.0 - 1.0 / np.e) * PRIOR
-    )
-    mu, p = np.array([[0.4, 0.6]] * 2), np.full((2, 3), 0.5)
+    assert_allclose(later.classes[0], share / np.e + 0.9 * (1.0 - 1.0 / np.e) * PRIOR)
     V = np.repeat(of_all_parts(0.9, 0.2), 2, axis=0)
-    bounded = q.with_ping(q.classes, np.array([0.5, 1.0]), mu, V, p)
-    assert bounded.probability()[1] == pytest.approx(SUREST)
+    hits, p = np.array([0.5, 1.0]), np.full((2, 3), 0.5)
+    bounded = q.with_ping(q.classes, hits, np.array([[0.4, 0.6]] * 2), V, p)
+    assert bounded.probability()[1] == pytest.approx(existence.SUREST)
     assert bounded.hits.tolist() == [1.5, 2.0]
 
 
@@ -147,109 +122,97 @@ def test_the_parts_of_a_component_are_those_of_a_normal_distribution():
 
 def test_misses_leave_what_may_lie_outside_the_beam():
     """Half of a component has left the beam: it is still there after any number of misses."""
-    mu, V = np.ones((1, 1)), np.array([[[0.99, 0.99, 0.5, 0.0, 0.0]]])
-    existence = Existence.of(0.9 * PRIOR[None], 1)
+    mu, V, p = np.ones((1, 1)), np.array([[[0.99, 0.99, 0.5, 0.0, 0.0]]]), np.full((1, 3), 0.9)
+    found = Existence.of(0.9 * PRIOR[None], 1)
     for _ in range(40):
-        p = np.full((1, 3), 0.9)
-        left = 1.0 - p * existence.visible(mu, V)
-        r = existence.classes.sum()
-        q = existence.classes * left / (1.0 - r + (existence.classes * left).sum())
-        existence = existence.with_ping(q, np.zeros(1), mu, V, p)
-    assert_allclose(existence.probability(), 0.4 * 0.9 / (0.4 * 0.9 + 0.1), rtol=1e-6)
+        q = found.classes * (1.0 - p * found.visible(mu, V))
+        q /= 1.0 - found.classes.sum() + q.sum()
+        found = found.with_ping(q, np.zeros(1), mu, V, p)
+    assert_allclose(found.probability(), 0.4 * 0.9 / (0.4 * 0.9 + 0.1), rtol=1e-6)
 
 
 def test_misses_count_component_by_component_since_the_last_echo():
     """Of a component that the beam always held, and one that has left it since the last echo."""
     mu, p = np.array([[0.5, 0.5]]), np.array([[0.9, 0.5, 0.2]])
     held, left = of_all_parts(0.9, 0.8), of_all_parts(0.9, 0.01)
-    q = Existence.of(PRIOR[None], 2).with_ping(PRIOR[None], np.ones(1), mu, held, p)
+    q, V = Existence.of(PRIOR[None], 2), left[0, :, :1]
+    q = q.with_ping(PRIOR[None], np.ones(1), mu, held, p)
     assert_allclose(q.silence[0, :, 2, 0], [0.9 / 0.85, 0.8 / 0.85])
-    for n in range(1, 4):
-        visible_now = q.visible(mu, left)
-        weight = np.array([[0.45], [0.4]]) / 0.85
-        V = left[0, :, :1]
-        weight = weight * (1.0 - p * V) ** (n - 1)
-        assert_allclose(visible_now[0], (weight * V).sum(axis=0) / weight.sum(axis=0))
+    for n in range(3):
+        weight = np.array([[0.45], [0.4]]) / 0.85 * (1.0 - p * V) ** n
+        assert_allclose(q.visible(mu, left)[0], (weight * V).sum(axis=0) / weight.sum(axis=0))
         q = q.with_ping(PRIOR[None], np.zeros(1), mu, left, p)
 
 
 def test_tracks_are_confirmed_for_good_by_existence_and_hits_and_end():
     q = np.array([0.96, 0.96, 0.9, 0.04, 0.04, 0.0005])[:, None] * PRIOR
-    existence = Existence.of(q, 1)._replace(hits=np.array([2.6, 2.4, 9.0, 9.0, 2.0, 1.0]))
+    found = Existence.of(q, 1)._replace(hits=np.array([2.6, 2.4, 9.0, 9.0, 2.0, 1.0]))
     before, hit = np.array([0, 0, 0, 1, 0, 0], np.uint8), np.array([1, 1, 1, 0, 0, 0], bool)
-    assert existence.status(before, hit, CONFIG).tolist() == [1, 0, 0, 2, 0, 0]
-    assert existence.ended(before > 0).tolist() == [False, False, False, True, False, True]
+    assert found.status(before, hit, CONFIG).tolist() == [1, 0, 0, 2, 0, 0]
+    assert found.ended(before > 0).tolist() == [False, False, False, True, False, True]
 
 
 def test_of_two_tracks_in_one_place_the_younger_ends():
     mean = np.array([[50.0, 0.1], [50.4, 0.1], [50.4, 0.13], [90.0, 0.1]])
-    covariance = np.tile(np.diag([0.1, 1e-5]), (4, 1, 1))
-    ids, confirmed = np.array([7, 9, 12, 13]), np.ones(4, bool)
-    hit = np.array([True, False, False, False])
-    near = older_nearby(mean, covariance, ids, confirmed, hit)
+    tracks = mean, np.tile(np.diag([0.1, 1e-5]), (4, 1, 1)), np.array([7, 9, 12, 13])
+    confirmed = np.ones(4, bool)
+    near = existence.older_nearby(*tracks, confirmed, np.array([True, False, False, False]))
     assert near.tolist() == [0, 7, 0, 0]
-    existence = Existence.of(np.tile(PRIOR, (4, 1)), 1)
-    for _ in range(MERGED):
-        assert not existence.ended(confirmed).any()
-        existence = existence.near(near)
-    assert existence.ended(confirmed).tolist() == [False, True, False, False]
+    found = Existence.of(np.tile(PRIOR, (4, 1)), 1)
+    for _ in range(existence.MERGED):
+        assert not found.ended(confirmed).any()
+        found = found.near(near)
+    assert found.ended(confirmed).tolist() == [False, True, False, False]
     both = np.array([True, True, False, False])
-    assert not older_nearby(mean, covariance, ids, confirmed, both).any()
+    assert not existence.older_nearby(*tracks, confirmed, both).any()
 
 
-SONAR = Sonar(geometry.Pose(np.array([3.0, -2.0, 20.0]), geometry.rotation(0.0, 0.0, 0.7)))
+SONAR = level(3.0, turned=(0.0, 0.0, 0.7))
 
 
-def ping_of(z, stamp_ns=SECOND, dt=0.5):
-    z = np.reshape(np.asarray(z, float), (-1, 2))
-    detections = Detections(stamp_ns=stamp_ns, range=z[:, 0], bearing=-z[:, 1])
-    ping = Ping(stamp_ns, SONAR, Echoes.of(detections, CONFIG), GroundMap())
-    ping.dt = dt
+def ping_of(z, seconds=1.0):
+    detections = echoes(round(seconds * SECOND), np.multiply(z, [1.0, -1.0]))
+    ping = Ping(detections.stamp_ns, SONAR, Echoes.of(detections, CONFIG), GroundMap())
+    ping.dt = 0.5
     return ping
 
 
 def test_a_seed_is_as_probable_as_births_beside_clutter():
-    (seeds,) = add_seeds(
-        (), ping_of([[60.0, 0.1], [30.0, 0.0]]), np.array([1.0, 0.25]), 0.02, CONFIG
-    )
+    ping = ping_of([[60.0, 0.1], [30.0, 0.0]])
+    (seeds,) = births.add_seeds((), ping, np.array([1.0, 0.25]), 0.02, CONFIG)
     born = 0.02 * 0.5 / (100.0 * np.radians(45.0))
     assert_allclose(seeds.classes.sum(axis=1), [1.0, 0.25] * np.array(born / (born + 0.02)))
-    assert_allclose(seeds.classes[0] / seeds.classes[0].sum(), PRIOR)
-    pd = np.array([0.9, 0.5, 0.2])
     q = seeds.classes[0]
-    left = with_miss(seeds, CONFIG).classes[0]
-    assert_allclose(left, q * (1.0 - pd) / (1.0 - q.sum() + (q * (1.0 - pd)).sum()))
-    late = ping_of([[60.0, 0.1]], stamp_ns=4 * SECOND)
-    assert len(add_seeds((seeds,), late, np.ones(1), 0.02, CONFIG)) == 1  # after 2.5 s it goes
-    soon = ping_of([[60.0, 0.1]], stamp_ns=3 * SECOND)
-    assert len(add_seeds((seeds,), soon, np.ones(1), 0.02, CONFIG)) == 2
+    assert_allclose(q / q.sum(), PRIOR)
+    missed = q * (1.0 - np.array([0.9, 0.5, 0.2]))
+    missed /= 1.0 - q.sum() + missed.sum()
+    assert_allclose(births.with_miss(seeds, CONFIG).classes[0], missed)
+    for seconds, left in ((4.0, 1), (3.0, 2)):  # after 2.5 s it goes
+        later = ping_of([[60.0, 0.1]], seconds)
+        assert len(births.add_seeds((seeds,), later, np.ones(1), 0.02, CONFIG)) == left
 
 
 def test_a_seed_is_met_as_the_closed_mixture_around_its_place_says():
-    (seeds,) = add_seeds((), ping_of([[60.0, 0.1]]), np.ones(1), 0.02, CONFIG)
-    assert isinstance(seeds, Seeds)
-    dt, d = 1.0, 60.0
+    (seeds,) = births.add_seeds((), ping_of([[60.0, 0.1]]), np.ones(1), 0.02, CONFIG)
+    dt, d, expected = 1.0, 60.0, np.array([0.5, 0.02])
     z = np.array([[60.9, 0.105], [95.0, -0.2]])
-    expected = np.array([0.5, 0.02])
-    place, _ = level_places(z, SONAR)
-    found = association_ratios(
-        seeds, ping_of(z, SECOND + round(dt * SECOND)), place, expected, CONFIG
-    )
+    place, _ = births.level_places(z, SONAR)
+    found = births.association_ratios(seeds, ping_of(z, 1.0 + dt), place, expected, CONFIG)
     # In the axes of the seed: the sonar has not moved.
     off = [60.9 * np.cos(0.005) - d, 60.9 * np.sin(0.005)]
-    R_r, R_b = CONFIG.range_std**2, np.radians(CONFIG.bearing_std_deg) ** 2
-    along = 2.0 * R_r + 0.05**2
-    across = 2.0 * R_b * d * d + (0.004 * d) ** 2 + (0.03 * dt) ** 2
+    along = 2.0 * CONFIG.range_std**2 + 0.05**2
+    across = 2.0 * np.radians(CONFIG.bearing_std_deg) ** 2 * d * d
+    across += (0.004 * d) ** 2 + (0.03 * dt) ** 2
     swung = 2.0 * 0.5**2 * (1.0 - np.exp(-dt / 20.0))
     L = sum(
         share * multivariate_normal.pdf(off, cov=np.diag([along + more, across + more]))
-        for share, more in zip(BEHAVIOURS, (0.0, swung, (0.75 * dt) ** 2))
+        for share, more in zip(births.BEHAVIOURS, (0.0, swung, (0.75 * dt) ** 2))
     )
     pd = seeds.classes[0] @ [0.9, 0.5, 0.2]
     assert_allclose(found, pd * L * d / 0.5, rtol=1e-9)
 
 
-def learned(error, config=CONFIG, tracks=1):
+def learned(error, config=CONFIG):
     """Scales after normalised innovations (N, 2) as the stated variances make them."""
     scales, last = Scales.none(), np.full((1, 2), np.nan)
     for e in error:
@@ -260,41 +223,31 @@ def learned(error, config=CONFIG, tracks=1):
 
 
 def test_the_scale_of_stated_variances_is_found():
-    rng = np.random.default_rng(2)
-    white = rng.normal(size=(600, 2))
-    assert_allclose(learned(white).factor(CONFIG), 1.0, atol=0.2)
-    assert not learned(white).warnings(CONFIG)
-    wide = learned(white * [3.0, 1.0 / 3.0])
+    """Echoes that err alike are not narrowed."""
+    white, keep = np.random.default_rng(2).normal(size=(600, 2)), np.exp(-0.1)
+    right, wide, broad = learned(white), learned(white * [3.0, 1.0 / 3.0]), learned(white * 3.0)
+    assert_allclose(right.factor(CONFIG), 1.0, atol=0.2)
+    assert not right.warnings(CONFIG)
     assert 7.0 < wide.factor(CONFIG)[0] < 10.0 and 0.1 <= wide.factor(CONFIG)[1] < 0.25
     ranges, bearings = wide.warnings(CONFIG)
-    assert ranges.startswith('ranges scatter') and ranges.endswith(
-        'times more than stated: allowed for'
-    )
+    assert ranges.startswith('ranges scatter') and ranges.endswith('than stated: allowed for')
     assert 'bearings scatter' in bearings and 'less than stated' in bearings
-    _, narrow = wide.warnings(CONFIG, True)
-    _, broad = learned(white * 3.0).warnings(CONFIG, True)
-    assert narrow == bearings and 'check the stamps of nav' in broad
+    assert wide.warnings(CONFIG, True)[1] == bearings
+    assert 'check the stamps of nav' in broad.warnings(CONFIG, True)[1]
     as_stated = evolve(CONFIG, variance_scale_min=1.0, variance_scale_max=1.0)
     assert learned(white * 3.0, as_stated).factor(as_stated).tolist() == [1.0, 1.0]
-
-
-def test_echoes_that_err_alike_are_not_narrowed():
-    rng = np.random.default_rng(3)
-    keep, e = np.exp(-0.1), np.zeros((600, 2))
-    for k in range(1, 600):
-        e[k] = keep * e[k - 1] + np.sqrt(1.0 - keep**2) * rng.normal(size=2)
-    assert (learned(e).factor(CONFIG) > 1.0).all()
-    assert (learned(e / 3.0).factor(CONFIG) > 0.5).all()
+    alike = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], white, axis=0)
+    assert (learned(alike).factor(CONFIG) > 1.0).all()
+    assert (learned(alike / 3.0).factor(CONFIG) > 0.5).all()
 
 
 def test_an_obstacle_among_thirty_false_echoes_is_the_only_one():
-    scene, final, tracker = tracked(
-        'approach', 3, {'sonar_lever': LEVER, 'clutter': 30.0, 'last_range': 50.0}
-    )
-    truth, confirmed = scene.truth[0], [e.extras['track_state'] > 0 for e in final.values()]
-    assert sum(int(each.sum()) for each in confirmed[10:]) == len(confirmed[10:])
-    for ping in range(10, len(truth.stamp_ns)):
-        assert followed(final[int(truth.stamp_ns[ping])], truth, ping, near=2.0) is not None
+    overrides = {'sonar_lever': LEVER, 'clutter': 30.0, 'last_range': 50.0}
+    scene, final, tracker = tracked('approach', 3, overrides)
+    confirmed = [(e.extras['track_state'] > 0).sum() for e in final.values()]
+    assert sum(confirmed[10:]) == len(confirmed[10:])
+    for ping, stamp in enumerate(scene.truth[0].stamp_ns.tolist()[10:], 10):
+        assert followed(final[stamp], scene.truth[0], ping, near=2.0) is not None
     assert 25.0 < tracker.health()['clutter_a_ping'] < 35.0
     last = list(final.values())[-1].extras
     assert last['existence'][last['track_state'] > 0] > 0.99
@@ -302,30 +255,19 @@ def test_an_obstacle_among_thirty_false_echoes_is_the_only_one():
 
 
 def test_an_obstacle_that_is_seldom_seen_is_confirmed_and_said_to_be():
-    scene, final, tracker = tracked(
-        'approach', 1, {'sonar_lever': LEVER, 'detection_probability': 0.2, 'last_range': 40.0}
-    )
-    truth = scene.truth[0]
-    ping = len(truth.stamp_ns) - 1
-    row = followed(final[int(truth.stamp_ns[ping])], truth, ping)
-    assert final[int(truth.stamp_ns[ping])].extras['detection_probability'][row] < 0.4
+    overrides = {'sonar_lever': LEVER, 'detection_probability': 0.2, 'last_range': 40.0}
+    scene, final, tracker = tracked('approach', 1, overrides)
+    last = final[int(scene.truth[0].stamp_ns[-1])]
+    row = followed(last, scene.truth[0], -1)
+    assert last.extras['detection_probability'][row] < 0.4
     (sentence,) = (each for each in tracker.warnings() if 'pings' in each)
     assert sentence.startswith('obstacles are seen in ') and 's to confirm' in sentence
 
 
-P_D = 0.9
-STILL = {
-    'scale_std': 0.0, 'navigation_noise': (0.0, 0.0, 0.0), 'drift_std': 0.0,
-    'yaw_error_std_deg': 0.0, 'navigation_delay_std': 0.0,
-}  # fmt: skip
-DEPTH = 20.0
-HALF = np.radians(7.5)
+FIXED = {'behaviours': ('fixed',), **EXACT, **NO_NOISE}
+ONE = DepthSlices(ObstacleConfig(behaviours=('fixed',), components=1))
+P_D, DEPTH, HALF = 0.9, 20.0, np.radians(7.5)
 R = np.diag([0.15**2, np.radians(0.25) ** 2])
-
-
-def pattern(elevation, edge):
-    edge, soft = edge * HALF, SOFT * HALF
-    return norm.cdf((edge - elevation) / soft) - norm.cdf((-edge - elevation) / soft)
 
 
 class Grid:
@@ -333,31 +275,28 @@ class Grid:
     way to it, m, and how far it lies below the sonar, m."""
 
     def __init__(self, d, prior):
-        self.x, self.z = np.meshgrid(
-            np.linspace(d - 9.0, d + 1.5, 700), np.linspace(-14.0, 14.0, 281), indexing='ij'
-        )
-        away = np.hypot(self.x, self.z)
-        ahead = self.x / away  # of the range with the way, where the offset is given
-        self.p = prior(self.z) * norm.pdf(away, d, np.sqrt(R[0, 0])) * ahead
+        way, z = np.linspace(d - 9.0, d + 1.5, 700), np.linspace(-14.0, 14.0, 281)
+        self.x, self.z = np.meshgrid(way, z, indexing='ij')
+        # Of the range with the way, where the offset is given.
+        self.p = prior(self.z) * self.x / np.hypot(self.x, self.z)
+        self.echo(0.0, d)
 
     def echo(self, went, d):
         self.p *= norm.pdf(np.hypot(self.x - went, self.z), d, np.sqrt(R[0, 0]))
 
+    def inside(self, went, pitch, edge):
+        up, edge, soft = np.arctan2(self.z, self.x - went) + pitch, edge * HALF, SOFT * HALF
+        return norm.cdf((edge - up) / soft) - norm.cdf((-edge - up) / soft)
+
     def miss(self, went, pitch):
-        self.p *= 1.0 - P_D * pattern(self.elevation(went, pitch), 1.0 - EDGE)
+        self.p *= 1.0 - P_D * self.inside(went, pitch, 1.0 - EDGE)
 
     def seen(self, went, pitch):
-        inside = pattern(self.elevation(went, pitch), 1.0 + EDGE)
-        self.p *= DOUBT + (1.0 - DOUBT) * inside
-
-    def elevation(self, went, pitch):
-        return np.arctan2(self.z, self.x - went) + pitch
+        self.p *= DOUBT + (1.0 - DOUBT) * self.inside(went, pitch, 1.0 + EDGE)
 
     def moments(self):
-        p = self.p.sum(axis=0) / self.p.sum()
-        z = self.z[0]
-        mean = p @ z
-        low, high = np.interp([0.05, 0.95], np.cumsum(p), z)
+        p, z = self.p.sum(axis=0) / self.p.sum(), self.z[0]
+        mean, (low, high) = p @ z, np.interp([0.05, 0.95], np.cumsum(p), z)
         return mean, np.sqrt(p @ (z - mean) ** 2), low, high, p[z < 0.0].sum()
 
 
@@ -365,27 +304,23 @@ class Grid:
 @pytest.mark.parametrize('offset, echoes', [(-2.5, 18), (-1.5, 35), (4.0, 32)])
 def test_an_obstacle_is_believed_where_an_exact_grid_filter_believes_it(offset, echoes):
     """Looking down by 3 degrees: where it is no longer seen tells the side."""
-    pitch, step = np.radians(-3.0), 0.75
-    turned = geometry.rotation(0.0, pitch, 0.0)
-    config = ObstacleConfig(behaviours=('fixed',), components=41, **STILL)
-    filter_ = DepthSlices(config)
-    rng = np.random.default_rng(5)
-    way = 45.0
+    pitch, step, way, rng = np.radians(-3.0), 0.75, 45.0, np.random.default_rng(5)
+    filter_ = DepthSlices(ObstacleConfig(components=41, **FIXED))
 
     def sonar(k):
-        return Sonar(Pose(np.array([step * k, 0.0, DEPTH]), turned))
+        return level(step * k, turned=(0.0, pitch, 0.0))
 
     def measured(k):
-        return np.hypot(way - step * k, offset) + 0.15 * rng.normal()
+        return np.array([[np.hypot(way - step * k, offset) + 0.15 * rng.normal(), 0.0]])
 
-    first = np.array([[measured(0), 0.0]])
+    first = measured(0)
     mixture = filter_.begin(first, R[None], sonar(0))
     parts = mixture.x[0, :, 2] - DEPTH, np.sqrt(mixture.P[0, :, 2, 2]), mixture.mu[0]
     grid = Grid(first[0, 0], lambda z: norm.pdf(z[..., None], *parts[:2]) @ parts[2])
     for k in range(1, echoes + 8):
         mixture, _ = filter_.advance(mixture, sonar(k - 1), sonar(k), 0.5)
         if k < echoes:
-            z = np.array([[measured(k), 0.0]])
+            z = measured(k)
             h, _ = filter_.expected(mixture, sonar(k))
             mixture, *_ = filter_.update(mixture, h, z, R[None], sonar(k))
             grid.echo(step * k, z[0, 0])
@@ -399,58 +334,55 @@ def test_an_obstacle_is_believed_where_an_exact_grid_filter_believes_it(offset, 
             view = filter_.view(mixture, sonar(k))
             ours = [view.state[0, 2], np.sqrt(view.covariance[0, 2, 2]), view.low[0], view.high[0]]
             *exact, above = grid.moments()
-            np.testing.assert_allclose(ours, exact, atol=0.1)
+            assert_allclose(ours, exact, atol=0.1)
             assert view.above[0] == pytest.approx(above, abs=0.02)
     # Ranges alone leave it at one half.
     assert view.above[0] > 0.65 if offset < 0.0 else view.above[0] < 0.45
 
 
+def mixture_at(distance, depth, tracks):
+    """Obstacles straight ahead, known to a metre."""
+    x, P = np.zeros((tracks, 1, 4)), np.tile(np.eye(4), (tracks, 1, 1, 1))
+    x[..., 0], x[..., 2] = distance, depth
+    return Mixture(x, P, np.ones((tracks, 1)))
+
+
 def test_misses_are_forgotten_with_the_next_echo_but_for_how_often_it_gives_none():
-    mixture = Mixture(np.zeros((2, 1, 4)), np.tile(np.eye(4), (2, 1, 1, 1)), np.ones((2, 1)))
-    mixture.x[..., 0], mixture.x[..., 2] = 30.0, DEPTH + 1.0
-    filter_ = DepthSlices(ObstacleConfig(behaviours=('fixed',), components=1))
-    sonar = Sonar(Pose(np.array([0.0, 0.0, DEPTH]), np.eye(3)))
+    mixture = mixture_at(30.0, DEPTH + 1.0, 2)
     looks = MissEvidence.first(mixture)
     for _ in range(3):
-        looks = looks.with_ping(np.array([True, False]), mixture, filter_, sonar, sonar)
+        looks = looks.with_ping(np.array([True, False]), mixture, ONE, level(), level())
     # It may be above the beam or below.
     assert looks.shown.P[1, 0, 2, 2] > 1.5 * mixture.P[1, 0, 2, 2]
     np.testing.assert_array_equal(mixture.P[1], np.eye(4)[None])
-    looks = looks.with_ping(np.array([True, True]), mixture, filter_, sonar, sonar)
+    looks = looks.with_ping(np.array([True, True]), mixture, ONE, level(), level())
     np.testing.assert_array_equal(looks.shown.P[1], looks.shown.P[0])
     assert looks.seen.tolist() == [5.0, 2.0] and looks.due[0] == 5.0 and looks.due[1] > 2.5
 
 
 def test_an_echo_says_that_the_beam_holds_it_and_leaving_sideways_takes_nothing_back():
-    mixture = Mixture(np.zeros((1, 1, 4)), np.eye(4)[None, None], np.ones((1, 1)))
-    mixture.x[..., 0], mixture.x[..., 2] = 10.0, DEPTH
-    filter_ = DepthSlices(ObstacleConfig(behaviours=('fixed',), components=1))
-    sonar = Sonar(Pose(np.array([0.0, 0.0, DEPTH]), np.eye(3)))
-    aside = Sonar(Pose(np.array([0.0, 0.0, DEPTH]), geometry.rotation(0.0, 0.0, 1.0)))
-    looks = MissEvidence.first(mixture).with_ping(np.array([True]), mixture, filter_, sonar, sonar)
+    mixture, aside = mixture_at(10.0, DEPTH, 1), level(turned=(0.0, 0.0, 1.0))
+    looks = MissEvidence.first(mixture)
+    looks = looks.with_ping(np.array([True]), mixture, ONE, level(), level())
     # The beam is 2.6 m high there: of a normal distribution, within 1.1 times that, .52.
     seen = looks.shown.P[0, 0, 2, 2]
     assert seen == pytest.approx(0.52, abs=0.03)
     mixture.x[..., 1] = -1.0
-    for last in (sonar, aside):
+    for last in (level(), aside):
         looks = looks._replace(shown=mixture._replace(P=looks.shown.P))
-        looks = looks.with_ping(np.array([False]), mixture, filter_, aside, last)
+        looks = looks.with_ping(np.array([False]), mixture, ONE, aside, last)
     assert looks.missed[0] == 0.0
     assert looks.shown.P[0, 0, 2, 2] == pytest.approx(seen, rel=0.01)
 
 
 def test_what_has_left_the_beam_is_no_longer_believed_in_it():
     """An obstacle 6 m above leaves the beam at 46 m."""
-    setting = scenario('above', {'last_range': 15.0})
-    scene = simulate(setting, 2)
-    truth = next(each for each in scene.truth if isinstance(each, TrueObstacle))
-    tracker, errors, risks = ObstacleTracker(ObstacleConfig(misses='evidence')), [], []
-    for item in scene.measurements:
-        for estimate in tracker.process(item.measurement):
-            ping = int(np.searchsorted(truth.stamp_ns, estimate.stamp_ns))
-            if truth.range[ping] < 25.0:
-                assert len(estimate) == 1 and estimate.extras['track_state'][0] > 0
-                errors.append(estimate.state[0, 2] - truth.vertical_offset[ping])
-                risks.append(estimate.extras['collision_probability'][0])
-    assert len(errors) > 5
-    assert np.abs(errors).max() < 1.5 and max(risks) < 0.01
+    scene, final, _ = tracked('above', 2, {'last_range': 15.0}, misses='evidence')
+    (truth,) = (each for each in scene.truth if isinstance(each, TrueObstacle))
+    near = np.flatnonzero(truth.range < 25.0)
+    assert len(near) > 5
+    for ping in near:
+        estimate = final[int(truth.stamp_ns[ping])]
+        assert len(estimate) == 1 and estimate.extras['track_state'][0] > 0
+        assert abs(estimate.state[0, 2] - truth.vertical_offset[ping]) < 1.5
+        assert estimate.extras['collision_probability'][0] < 0.01
