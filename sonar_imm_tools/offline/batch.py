@@ -29,22 +29,9 @@ from sonar_imm.parameters import Config, ConfigError
 from sonar_imm.trackers import SYSTEMS
 
 from ..recordings.reader import BagError, BagReader
+from . import run_folder as results
 from .jobs import as_they_end, cluster, processes, sentence_of
-from .run_folder import (
-    AS_CSV,
-    AS_PARQUET,
-    CSV,
-    finite,
-    NO_TABLE,
-    PARQUET,
-    read_json,
-    RUN,
-    run_record,
-    RunFolder,
-    SOUNDINGS,
-    summaries,
-    SUMMARY,
-)
+from .run_folder import RunFolder, SUMMARY
 from .tracking import InputOptions, OfflineRun, write_run
 
 TRACKED, KEPT, FAILED = 'tracked', 'kept', 'failed'
@@ -68,7 +55,7 @@ class Job:
     overwrite: bool = False
     resume: bool = False
     strict: bool = False
-    tables: str = AS_CSV
+    tables: str = results.AS_CSV
     version: str = __version__
 
     def outcome(self, **came: Any) -> Outcome:
@@ -118,11 +105,11 @@ def _same_run(folder: RunFolder, offline: OfflineRun) -> dict[str, Any] | None:
 
     Raises `BagError` when there is another.
     """
-    if not (folder.path / RUN).is_file():
+    if not (folder.path / results.RUN).is_file():
         return None
     run = folder.read_run()
     # As JSON has it: tuples are lists.
-    wanted = json.loads(json.dumps(finite(run_record(**offline.recipe()))))
+    wanted = json.loads(json.dumps(results.finite(results.run_record(**offline.recipe()))))
     other = [name for name in wanted if run.get(name) != wanted[name]]
     if not other:
         return run
@@ -141,11 +128,11 @@ def _same_run(folder: RunFolder, offline: OfflineRun) -> dict[str, Any] | None:
 
 def _complete(job: Job, run: Mapping[str, Any]) -> bool:
     """Whether the tables are there that are wanted."""
-    if job.tables == NO_TABLE:
+    if job.tables == results.NO_TABLE:
         return RunFolder(job.folder).bins() is None
-    names = [CSV, *([SOUNDINGS] if 'soundings' in run else [])]
-    if job.tables == AS_PARQUET:
-        names = [PARQUET[name] for name in names]
+    names = [results.CSV, *([results.SOUNDINGS] if 'soundings' in run else [])]
+    if job.tables == results.AS_PARQUET:
+        names = [results.PARQUET[name] for name in names]
     return all((job.folder / name).is_file() for name in names)
 
 
@@ -182,7 +169,7 @@ def run_jobs(
 
 def _seen(outcome: Outcome) -> Outcome:
     """A worker on another machine may have written where this one does not see it."""
-    if outcome.state == FAILED or (outcome.folder / RUN).is_file():
+    if outcome.state == FAILED or (outcome.folder / results.RUN).is_file():
         return outcome
     sentence = (
         f'a worker wrote {outcome.folder}, which is not to be seen here: the folder has to lie '
@@ -197,7 +184,8 @@ def summary_of(out: Path, outcomes: Iterable[Outcome], name: str = SUMMARY) -> d
     fresh = [_entry(out, outcome) for outcome in outcomes]
     new = {entry['folder'] for entry in fresh}
     earlier = _entries(out / name) if (out / name).is_file() else []
-    kept = [e for e in earlier if e['folder'] not in new and (out / e['folder'] / RUN).is_file()]
+    kept = [entry for entry in earlier if entry['folder'] not in new]
+    kept = [entry for entry in kept if (out / entry['folder'] / results.RUN).is_file()]
     return {'runs': kept + fresh}
 
 
@@ -225,11 +213,11 @@ def run_folders(out: Path) -> list[Path]:
 
     Raises `BagError` when there is no run.
     """
-    lists = summaries(out)
-    if (out / RUN).is_file() or not lists:
+    lists = results.summaries(out)
+    if (out / results.RUN).is_file() or not lists:
         return [out]
     named = dict.fromkeys(out / entry['folder'] for path in lists for entry in _entries(path))
-    found = [folder for folder in named if (folder / RUN).is_file()]
+    found = [folder for folder in named if (folder / results.RUN).is_file()]
     if not found:
         raise BagError(f'{out} holds no finished run: all that {lists[0].name} names failed')
     return found
@@ -242,7 +230,7 @@ def check_summary(out: Path, name: str = SUMMARY) -> None:
 
 
 def _entries(path: Path) -> list[dict[str, Any]]:
-    content = read_json(path)
+    content = results.read_json(path)
     try:
         entries = content['runs']
         if not all(isinstance(entry['folder'], str) for entry in entries):

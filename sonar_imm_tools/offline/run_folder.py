@@ -45,18 +45,8 @@ import scipy
 from msg_adapters.estimates import read_estimate, write_estimate
 from msg_adapters.soundings import write_soundings
 from sonar_imm import __version__
+from sonar_imm import files as disk
 from sonar_imm.estimates import Estimate
-from sonar_imm.files import (
-    beside,
-    hindrance,
-    mark,
-    MARKER,
-    on_disk,
-    remove_leftovers,
-    replaced,
-    sync_folder,
-    whole,
-)
 from sonar_imm.measurements import Rejection
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers import SYSTEMS
@@ -223,7 +213,7 @@ class RunFolder:
         along where an earlier run is replaced. Raises `BagError` when a run is here and may not be
         overwritten, or when nothing shows that this package made it.
         """
-        remove_leftovers(self.path)
+        disk.remove_leftovers(self.path)
         if self.path.exists() and not self.path.is_dir():
             raise BagError(f'{self.path} is a file; a folder is needed')
         is_input = os.path.realpath(self.path) in map(os.path.realpath, inputs)
@@ -238,18 +228,18 @@ class RunFolder:
         if old:
             if why := self._hindrance(inputs):
                 raise BagError(why)
-            with replaced(self.path, (*_RUN_FILES, MARKER)) as place:
-                mark(place, KIND)
+            with disk.replaced(self.path, (*_RUN_FILES, disk.MARKER)) as place:
+                disk.mark(place, KIND)
                 yield RunFolder(place)
         elif not self.path.exists():
-            with whole(self.path) as place:
+            with disk.whole(self.path) as place:
                 place.mkdir()
-                mark(place, KIND)
+                disk.mark(place, KIND)
                 yield RunFolder(place)
         else:
-            with beside(self.path / 'run') as place:
+            with disk.beside(self.path / 'run') as place:
                 yield RunFolder(place)
-                on_disk(place)
+                disk.on_disk(place)
                 self._take_in(place)
 
     def _hindrance(self, inputs: Sequence[Path]) -> str:
@@ -258,7 +248,7 @@ class RunFolder:
             known = 'sonar_imm' in self.read_run().get('versions', {})
         except BagError:
             known = False
-        if why := hindrance(self.path, KIND, inputs, known=known):
+        if why := disk.hindrance(self.path, KIND, inputs, known=known):
             return why
         bag = self.path / BAG
         others = [
@@ -272,14 +262,14 @@ class RunFolder:
         """Move a run from `place` to this folder, run.json as the last; all of it or nothing."""
         moved = []
         try:
-            if not os.path.lexists(self.path / MARKER):
-                mark(self.path, KIND)
-                moved.append(MARKER)
+            if not os.path.lexists(self.path / disk.MARKER):
+                disk.mark(self.path, KIND)
+                moved.append(disk.MARKER)
             for name in reversed(_RUN_FILES):
                 if (place / name).exists():
                     os.rename(place / name, self.path / name)
                     moved.append(name)
-            sync_folder(self.path)
+            disk.sync_folder(self.path)
         except BaseException:
             for name in reversed(moved):
                 os.rename(self.path / name, place / name)
@@ -334,7 +324,7 @@ class RunFolder:
     def write_json(self, name: str, content: Any) -> Path:
         """Write `content` as JSON; NaN and infinity, which JSON lacks, become null."""
         path = self.path / name
-        with whole(path, follow=False) as unfinished:
+        with disk.whole(path, follow=False) as unfinished:
             text = json.dumps(finite(content), indent=2) + '\n'
             unfinished.write_text(text, encoding='utf-8')
         return path
@@ -343,7 +333,7 @@ class RunFolder:
         """The content of run.json. Raises `BagError` when the folder holds no finished run."""
         path = self.path / RUN
         if not self.path.exists():
-            remove_leftovers(self.path)  # a killed command may have moved it aside
+            disk.remove_leftovers(self.path)  # a killed command may have moved it aside
         if not os.path.lexists(path) and (lists := summaries(self.path)):
             raise BagError(
                 f'{self.path} holds several runs, which {lists[0].name} lists; name the folder of '
@@ -366,7 +356,7 @@ class RunFolder:
         the one called `but`, or of a file of its recording."""
         place = Path(os.path.realpath(out))
         here = Path(os.path.realpath(self.path))
-        named = [here / name for name in (*_RUN_FILES, MARKER)]
+        named = [here / name for name in (*_RUN_FILES, disk.MARKER)]
         own = [*named, *(Path(os.path.realpath(name)) for name in named)]
         if place != here / but and any(place.is_relative_to(item) for item in own):
             raise BagError(f'{out} is a file of the run {self.path}; choose another name')

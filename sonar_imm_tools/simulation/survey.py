@@ -377,7 +377,10 @@ def _line(
     slant = SOUND_SPEED * seconds
     stated = np.einsum('pij,bj->pbi', reported, fan)
     xyz = reported_place[:, None, :] + slant[..., None] * stated
-    own = _along_swath(rng, len(t), config.beams) * config.noise
+    # Noise of unit variance that neighbours of a swath share in part, as a filter's is.
+    white = rng.standard_normal((len(t), 2, config.beams))
+    own = np.moveaxis(lasting(np.moveaxis(white, -1, 0), 1.0 / 3.0), 0, -1)
+    own = own.reshape(len(t), 2 * config.beams) * config.noise
     xyz[..., 2] += own
     D, Y = -slant * stated[..., 2], slant * np.hypot(stated[..., 0], stated[..., 1])
     noise = np.full(D.shape, config.noise**2)
@@ -410,13 +413,6 @@ def _slow(rng: Generator, t: FloatArray, seconds: float) -> FloatArray:
     """Errors of unit variance at times t (P,)."""
     keep = math.exp(-(t[1] - t[0]) / seconds) if len(t) > 1 else 0.0
     return lasting(rng.standard_normal(len(t)), keep)
-
-
-def _along_swath(rng: Generator, pings: int, beams: int) -> FloatArray:
-    """Noise of unit variance that neighbours of a swath share in part, as a filter's is."""
-    white = rng.standard_normal((pings, 2, beams))
-    own = np.moveaxis(lasting(np.moveaxis(white, -1, 0), 1.0 / 3.0), 0, -1)
-    return own.reshape(pings, 2 * beams)
 
 
 def _ray(

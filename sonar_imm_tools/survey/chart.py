@@ -24,7 +24,7 @@ from sonar_imm.estimation.arrays import FloatArray
 
 from ..recordings.export.points import Points, wkt_of
 from ..recordings.sources import BagError
-from .grid import grid_of_looks, Nodes, Soundings, tiles_of
+from .grid import Box, grid_of_looks, Nodes, Soundings, tiles_of
 from .line import line_of
 
 MOST_CELLS = 25_000_000
@@ -76,7 +76,7 @@ def values_of(nodes: Nodes) -> dict[str, FloatArray]:
     }
 
 
-def extent_of(xy: FloatArray, cell: float) -> tuple[int, int, int, int]:
+def extent_of(xy: FloatArray, cell: float) -> Box:
     """First column and row, columns and rows of the cells that hold soundings.
 
     Raises `BagError` for no soundings or for too many cells.

@@ -39,6 +39,8 @@ an outlier that is alone has no other depth beside it."""
 HALO = 6
 """Cells around a tile whose soundings its nodes need."""
 LEAST_GAP = 0.25
+Box = tuple[int, int, int, int]
+"""First column and row, columns and rows of cells."""
 
 
 @frozen(eq=False)
@@ -106,7 +108,7 @@ class _Hypotheses:
 def grid_of_looks(
     soundings: Soundings,
     cell: float,
-    box: tuple[int, int, int, int],
+    box: Box,
     budget: ErrorBudget,
     covariance: FloatArray | None = None,
     crossing_rms: float = 0.0,
@@ -145,9 +147,7 @@ def grid_of_looks(
     return _nodes(found, ix, iy, inside, top, second, odds, np.sqrt(variance))
 
 
-def tiles_of(
-    soundings: Soundings, cell: float
-) -> Iterator[tuple[tuple[int, int, int, int], Soundings]]:
+def tiles_of(soundings: Soundings, cell: float) -> Iterator[tuple[Box, Soundings]]:
     """Boxes of 256 x 256 cells that hold soundings, each with those it needs."""
     size = 256
     index = np.floor(soundings.line.xy / cell).astype(np.int64)
@@ -164,9 +164,7 @@ def tiles_of(
             yield (tx * size, ty * size, size, size), soundings.chosen(strip[near])
 
 
-def _pairs(
-    xy: FloatArray, cell: float, box: tuple[int, int, int, int]
-) -> tuple[IntArray, IntArray, FloatArray]:
+def _pairs(xy: FloatArray, cell: float, box: Box) -> tuple[IntArray, IntArray, FloatArray]:
     """Soundings and nodes that are in reach of each other: number of the sounding, key of the node
     in the box, place less the node's (p, 2)."""
     x0, y0, columns, rows = box

@@ -35,7 +35,7 @@ from ..offline.run_folder import fingerprint, finite
 from ..recordings.export.points import origin_of, read_points
 from ..recordings.sources import BagError
 from ..recordings.writer import naming
-from .grid import grid_of_looks, HALO, Soundings
+from .grid import Box, grid_of_looks, HALO, Soundings
 from .line import budget_of, Line, line_of, without_far
 from .looks import Looks, looks_of
 
@@ -90,7 +90,7 @@ class Tile:
         return f'L{self.cell:g}_{self.i}_{self.j}'
 
     @property
-    def box(self) -> tuple[int, int, int, int]:
+    def box(self) -> Box:
         """First column and row, columns and rows of its cells."""
         return self.i * TILE, self.j * TILE, TILE, TILE
 

@@ -20,23 +20,8 @@ from plotly.subplots import make_subplots
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimation.arrays import FloatArray
 
-from ..plotting import (
-    AMBER,
-    BARE,
-    COLOURS,
-    GREY,
-    in_degrees,
-    INK,
-    MOST_POINTS,
-    nis_figure,
-    Picture,
-    seconds,
-    thin,
-    TIME,
-    transparent,
-    TRUTH,
-    view_of,
-)
+from .. import plotting as plot
+from ..plotting import Picture
 from ..report import Section
 from .series import match, Matching, Series, Truth
 
@@ -60,7 +45,7 @@ def sections(
         'Map',
         f'Seen from above.{"" if truth is None else " Dotted: truth."} Crosses: raw fixes. '
         'Shaded: ellipses that should hold the target 95 % of the time.',
-        in_metres if origin is None else in_degrees(in_metres, origin),
+        in_metres if origin is None else plot.in_degrees(in_metres, origin),
         picture=True,
     )
     track_id = series.longest_track()
@@ -93,7 +78,7 @@ def sections(
             'Normalised innovations (NIS)',
             'Distance of each measurement from its prediction, in units of the stated '
             'uncertainty, squared. Amber: where the mean should stay.',
-            nis_figure(seconds(hits.stamp_ns, hits.scan_ns), hits.nis, hits.nis_dof),
+            plot.nis_figure(plot.seconds(hits.stamp_ns, hits.scan_ns), hits.nis, hits.nis_dof),
         )
 
 
@@ -108,7 +93,7 @@ def true_course(matching: Matching | None, track_id: int) -> tuple[FloatArray, F
     if not len(stamps):
         return None
     course = np.degrees(np.arctan2(velocity[moving, 1], velocity[moving, 0]))
-    return seconds(stamps, matching.series.scan_ns), course
+    return plot.seconds(stamps, matching.series.scan_ns), course
 
 
 def map_figure(
@@ -123,21 +108,21 @@ def map_figure(
     """
     figure = Picture()
     if fixes is not None and len(fixes):
-        shown = thin(len(fixes), MOST_POINTS)
+        shown = plot.thin(len(fixes), plot.MOST_POINTS)
         figure.add_scattergl(
             x=fixes.state[shown, 0],
             y=fixes.state[shown, 1],
             mode='markers',
             name='raw fixes',
             hoverinfo='skip',
-            marker={'symbol': 'x-thin', 'size': 5, 'line': {'color': GREY, 'width': 1}},
+            marker={'symbol': 'x-thin', 'size': 5, 'line': {'color': plot.GREY, 'width': 1}},
         )
     paths = truth.paths if truth else ()
     for path in paths:
-        x, y = path.state[thin(len(path.stamp_ns), MOST_POINTS), :2].T
+        x, y = path.state[plot.thin(len(path.stamp_ns), plot.MOST_POINTS), :2].T
         legend: dict[str, Any] = {'legendgroup': 'truth', 'showlegend': path is paths[0]}
         hover = f'target {path.track_id}: x %{{x:.2f}}, y %{{y:.2f}}'
-        figure.line(x, y, 'truth', INK, line=TRUTH, hovertemplate=hover, **legend)
+        figure.line(x, y, 'truth', plot.INK, line=plot.TRUTH, hovertemplate=hover, **legend)
     ids, counts = np.unique(series.track_id, return_counts=True)
     for order, track_id in enumerate(ids[np.argsort(-counts, kind='stable')]):
         track = series.pick(series.track_id == track_id)
@@ -145,21 +130,21 @@ def map_figure(
         _add_track(figure, track, order, escape(series.name(track_id, names or {})))
     # Clutter can lie anywhere: the first view shows tracks and truth, the rest by zooming out.
     every = [series.state[:, :2], *(path.state[:, :2] for path in paths)]
-    x_range, y_range = view_of(np.concatenate(every))
+    x_range, y_range = plot.view_of(np.concatenate(every))
     y = {'title': 'y [m]', 'range': y_range, 'scaleanchor': 'x', 'scaleratio': 1}
     return figure.styled(640, {'title': 'x [m]', 'range': x_range}, y)
 
 
 def _add_track(figure: Picture, track: Series, order: int, name: str) -> None:
-    colour = COLOURS[order % len(COLOURS)]
+    colour = plot.COLOURS[order % len(plot.COLOURS)]
     x, y = outlines(track.state[:, :2], track.covariance[:, :2, :2]).T
     group: dict[str, Any] = {'legendgroup': name, 'showlegend': False}
-    fill = transparent(colour, 0.10)
+    fill = plot.transparent(colour, 0.10)
     area = group | {'fill': 'toself', 'fillcolor': fill, 'hoverinfo': 'skip'}
-    figure.line(x, y, None, transparent(colour, 0.35), 1, **area)
-    track = track.pick(thin(len(track), MOST_POINTS))
+    figure.line(x, y, None, plot.transparent(colour, 0.35), 1, **area)
+    track = track.pick(plot.thin(len(track), plot.MOST_POINTS))
     shown = group | {'showlegend': order < MOST_TRACKS_NAMED, 'mode': 'lines+markers'}
-    time = seconds(track.stamp_ns, track.scan_ns)
+    time = plot.seconds(track.stamp_ns, track.scan_ns)
     hover = '%{customdata:.1f} s: x %{x:.2f}, y %{y:.2f}'
     shown |= {'marker': {'size': 4}, 'customdata': time, 'hovertemplate': hover}
     x, y = track.state[:, :2].T
@@ -173,7 +158,7 @@ def error_figure(matching: Matching, track_id: int) -> Picture:
     row = matching.row[rows]
     order = np.argsort(series.stamp_ns[row], kind='stable')
     row, error = row[order], matching.error[rows][order]
-    time = seconds(series.stamp_ns[row], series.scan_ns)
+    time = plot.seconds(series.stamp_ns[row], series.scan_ns)
     figure = make_subplots(
         figure=Picture(), rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06
     )
@@ -182,10 +167,10 @@ def error_figure(matching: Matching, track_id: int) -> Picture:
         shared = {'showlegend': axis == 0, **place}
         half = 1.96 * np.sqrt(series.covariance[row, axis, axis])
         band = {'name': 'predicted 95 % band', 'legendgroup': 'band', **shared}
-        figure.band(time, half, -half, AMBER, (0.28, 0.6), **band)
+        figure.band(time, half, -half, plot.AMBER, (0.28, 0.6), **band)
         line = {'mode': 'lines+markers', 'marker': {'size': 3}, 'legendgroup': 'error', **shared}
         name_of_all = 'error of the track'
-        figure.line(time, error[:, axis], name_of_all, COLOURS[0], 1.2, gl=True, **line)
+        figure.line(time, error[:, axis], name_of_all, plot.COLOURS[0], 1.2, gl=True, **line)
         figure.update_yaxes(title=f'{name} error [m]', **place)
     figure.update_xaxes(title='time [s]', row=2, col=1)
     return figure.styled(460, {'zeroline': False}, {})
@@ -194,12 +179,12 @@ def error_figure(matching: Matching, track_id: int) -> Picture:
 def sigma_figure(series: Series, track_id: int) -> Picture:
     """Stated standard deviations over time, for runs without truth."""
     track = series.pick(series.track_id == track_id)
-    time = seconds(track.stamp_ns, track.scan_ns)
+    time = plot.seconds(track.stamp_ns, track.scan_ns)
     figure = Picture()
     for axis, name in enumerate('xy'):
         sigma = np.sqrt(track.covariance[:, axis, axis])
-        figure.line(time, sigma, name, COLOURS[axis], 1.5, gl=True)
-    return figure.styled(320, TIME, {'title': 'stated sigma [m]', 'rangemode': 'tozero'})
+        figure.line(time, sigma, name, plot.COLOURS[axis], 1.5, gl=True)
+    return figure.styled(320, plot.TIME, {'title': 'stated sigma [m]', 'rangemode': 'tozero'})
 
 
 def models_figure(
@@ -211,14 +196,14 @@ def models_figure(
     truth_course: (seconds, degrees) of the true course, drawn over the heading rows; None without.
     """
     track = series.pick(series.track_id == track_id)
-    track = track.pick(thin(len(track), 4000))
+    track = track.pick(plot.thin(len(track), 4000))
     names, probabilities = headings_together(track.model_names, track.probabilities)
     order = np.array(model_order(names), int)
     headings = sum(name.startswith('heading_') for name in names)
     names = np.array(names)[order]
     figure = Picture()
     figure.image(
-        seconds(track.stamp_ns, track.scan_ns),
+        plot.seconds(track.stamp_ns, track.scan_ns),
         np.arange(len(order)),
         probabilities[:, order].T,
         customdata=np.tile(names[:, None], (1, len(track))),
@@ -227,17 +212,17 @@ def models_figure(
     if truth_course is not None and headings:
         time, degrees = truth_course
         row = len(order) - headings + np.mod(degrees, 360.0) * headings / 360.0
-        figure.points(time, row, 'true course', COLOURS[1])
+        figure.points(time, row, 'true course', plot.COLOURS[1])
         figure.data[-1].showlegend = True
     rows = {'tickvals': np.arange(len(order)), 'range': [-0.5, len(order) - 0.5]}
     labels = [model_label(name) for name in names]
     height = 180 + 18 * len(order)
-    return figure.styled(height, TIME | BARE, {'ticktext': labels} | rows | BARE)
+    return figure.styled(height, plot.TIME | plot.BARE, {'ticktext': labels} | rows | plot.BARE)
 
 
 def outlines(mean: FloatArray, covariance: FloatArray, *, probability: float = 0.95) -> FloatArray:
     """(m, 2) outlines of Gaussian ellipses that hold `probability`, NaN rows between them."""
-    shown = thin(len(mean), MOST_ELLIPSES)
+    shown = plot.thin(len(mean), MOST_ELLIPSES)
     values, vectors = np.linalg.eigh(covariance[shown])
     angle = np.linspace(0.0, 2.0 * np.pi, 40)
     circle = np.stack([np.cos(angle), np.sin(angle)])

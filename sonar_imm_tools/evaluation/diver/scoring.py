@@ -36,14 +36,7 @@ from sonar_imm.estimation.consistency import gospa, switches_by_scan, switching_
 from sonar_imm.measurements import Fix, Fixes, NOBODY, scan_of
 
 from ... import SECOND
-from ..numbers import (
-    chi2_summary,
-    coverage_verdict,
-    error_summary,
-    nis_summary,
-    relative_nees,
-    usable_nees,
-)
+from .. import numbers
 from .series import match, Matching, Series, track_summary, Truth
 
 COVERAGE_LEVELS = (0.5, 0.9, 0.95)
@@ -75,7 +68,7 @@ def score(
         'rows_confirmed': len(confirmed),
         'rows_tentative': len(series) - len(confirmed),
         'tracks_confirmed': len(np.unique(confirmed.track_id)),
-        'consistency': {'nis': nis_summary(hits.nis, hits.nis_dof)},
+        'consistency': {'nis': numbers.nis_summary(hits.nis, hits.nis_dof)},
         'models': model_summary(confirmed),
     }
     if truth is None or not len(truth):
@@ -87,12 +80,12 @@ def score(
     metrics['scored_stamps'] = len(matching.scan_ns)
     beyond = len(matching.beyond_row)
     metrics['beyond_cutoff'] = {'n': beyond, 'share': beyond / max(1, beyond + len(matching.row))}
-    metrics['position'] = error_summary(matching.distance)
+    metrics['position'] = numbers.error_summary(matching.distance)
     speed_error = np.hypot(*matching.error[:, 2:].T)
-    metrics['velocity'] = error_summary(speed_error[np.isfinite(speed_error)], unit='mps')
+    metrics['velocity'] = numbers.error_summary(speed_error[np.isfinite(speed_error)], unit='mps')
     if fixes is not None and len(fixes):
         raw = match(fixes, truth, cutoff=cutoff)
-        found: dict[str, Any] = error_summary(raw.distance)
+        found: dict[str, Any] = numbers.error_summary(raw.distance)
         metrics['raw_fix'] = {**found, 'beyond': len(raw.beyond_row)}
         metrics['same_stamps'] = at_same_stamps(matching, raw)
     metrics['consistency'].update(truth_consistency(matching))
@@ -164,15 +157,15 @@ def truth_consistency(matching: Matching) -> dict[str, Any]:
     error, covariance = matching.error, series.covariance[matching.row]
     far = series.state[matching.beyond_row] - matching.beyond_truth, matching.beyond_row
     position, position_far = (
-        usable_nees(e[:, :2], series.covariance[rows, :2, :2])
+        numbers.usable_nees(e[:, :2], series.covariance[rows, :2, :2])
         for e, rows in ((error, matching.row), far)
     )
     coverage = {f'{100 * level:g}': _coverage(position, level) for level in COVERAGE_LEVELS}
     whole = _coverage(np.concatenate([position, position_far]), 0.95)
     near = _summary(position, position_far, 2)
-    far_too = chi2_summary(np.concatenate([position, position_far]), 2)
+    far_too = numbers.chi2_summary(np.concatenate([position, position_far]), 2)
     verdict, of_all = (
-        coverage_verdict(share, nees=relative_nees(summary))
+        numbers.coverage_verdict(share, nees=numbers.relative_nees(summary))
         for share, summary in ((coverage['95'], near), (whole, far_too))
     )
     result: dict[str, Any] = {
@@ -182,8 +175,8 @@ def truth_consistency(matching: Matching) -> dict[str, Any]:
         'singular_position_covariances': len(error) - len(position),
     }
     if known := int(np.isfinite(error).all(axis=1).sum()):
-        state = usable_nees(error, covariance)
-        far_state = usable_nees(far[0], series.covariance[far[1]])
+        state = numbers.usable_nees(error, covariance)
+        far_state = numbers.usable_nees(far[0], series.covariance[far[1]])
         result['nees_state'] = _summary(state, far_state, 4)
         result['singular_state_covariances'] = known - len(state)
     return result
@@ -198,9 +191,9 @@ def depth_summary(matching: Matching, truth: Truth) -> dict[str, Any]:
     known = np.isfinite(error).all(axis=1)
     if not known.any():
         return {}
-    whole = usable_nees(error[known], series.place_covariance[matching.row[known]])
+    whole = numbers.usable_nees(error[known], series.place_covariance[matching.row[known]])
     down = np.abs(error[known, 2])
-    return {'depth': {**error_summary(down), 'nees_3d': chi2_summary(whole, 3)}}
+    return {'depth': {**numbers.error_summary(down), 'nees_3d': numbers.chi2_summary(whole, 3)}}
 
 
 def _coverage(position: FloatArray, level: float) -> float:
@@ -211,9 +204,9 @@ def _coverage(position: FloatArray, level: float) -> float:
 
 def _summary(nees: FloatArray, beyond: FloatArray, dof: int) -> dict[str, Any]:
     """`chi2_summary` of the pairs within the cutoff."""
-    kept = chi2_summary(nees, dof)
+    kept = numbers.chi2_summary(nees, dof)
     if len(nees) and len(beyond):
-        whole = chi2_summary(np.concatenate([nees, beyond]), dof)
+        whole = numbers.chi2_summary(np.concatenate([nees, beyond]), dof)
         sides = [np.searchsorted([s['low'], s['high']], s['mean']) for s in (kept, whole)]
         if sides[0] != sides[1]:
             kept['believable'] = None
@@ -277,7 +270,7 @@ def best_lag(matching: Matching, truth: Truth) -> dict[str, float]:
     def rmse(lag: float) -> float:
         states = truth.shifted(lag).at(stamp_ns)[matching.target, np.arange(len(stamp_ns)), :2]
         distance = np.hypot(*(position - states).T)
-        return error_summary(distance[np.isfinite(distance)])['rmse_m']
+        return numbers.error_summary(distance[np.isfinite(distance)])['rmse_m']
 
     reach = min(LAG_RANGE, float(np.ptp(stamp_ns)) / SECOND / 4.0) if len(stamp_ns) else 0.0
     if reach <= 0.0:

@@ -19,20 +19,8 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS
 
-from ..plotting import (
-    AMBER,
-    COLOURS,
-    GREY,
-    in_degrees,
-    INK,
-    MOST_POINTS,
-    nis_figure,
-    Picture,
-    seconds,
-    thin,
-    TRUTH,
-    view_of,
-)
+from .. import plotting as plot
+from ..plotting import Picture
 from ..report import Section
 from .series import level, Matching, Series, TruePath
 
@@ -52,11 +40,14 @@ def sections(
     """The sections of one run. metrics: content of ``metrics.json``; received: the measurements;
     gap: seconds without truth across which it is not interpolated; origin: as `map_section`."""
     yield from map_section(series, received, origin)
+    # The obstacle that each track was matched with last.
+    pairs = () if found is None else zip(found.series.track_id[found.row], found.target)
+    last = {int(track): truth[target] for track, target in pairs}
     yield Section(
         'Height over range',
         'How far each obstacle lies below the sonar, as it comes nearer from left to right. '
         f'Shaded: the 90 % band.{" Dotted: truth." if truth else ""}',
-        offset_figure(series, _truths(found, truth), gap),
+        offset_figure(series, last, gap),
         picture=True,
     )
     yield Section(
@@ -108,12 +99,13 @@ def sections(
         )
     hits = series.pick(np.isfinite(series.nis))
     if len(hits):
+        time = plot.seconds(hits.stamp_ns, hits.scan_ns)
         yield Section(
             'Normalised innovations (NIS)',
             'Distance of each detection from its prediction, in units of the stated uncertainty, '
             'squared. NIS says nothing about the height: with a wrong sign of roll it is perfect '
             'too.',
-            nis_figure(seconds(hits.stamp_ns, hits.scan_ns), hits.nis, np.full(len(hits), 2.0)),
+            plot.nis_figure(time, hits.nis, np.full(len(hits), 2.0)),
         )
 
 
@@ -126,34 +118,26 @@ def map_section(
     if not (len(way) and len(series)):
         return
     figure = Picture()
-    x, y = way[thin(len(way), MOST_POINTS)].T
-    figure.line(x, y, 'vehicle', INK, 2)
+    x, y = way[plot.thin(len(way), plot.MOST_POINTS)].T
+    figure.line(x, y, 'vehicle', plot.INK, 2)
     for name, colour, track in _by_track(series):
-        x, y = track.place[thin(len(track), MOST_POINTS)].T
+        x, y = track.place[plot.thin(len(track), plot.MOST_POINTS)].T
         figure.points(x, y, name, colour)
         figure.data[-1].hovertemplate = f'{name}: x %{{x:.1f}}, y %{{y:.1f}}'
-    x_range, y_range = view_of(np.concatenate([way, series.place]))
+    x_range, y_range = plot.view_of(np.concatenate([way, series.place]))
     along = {'title': 'y [m]', 'range': y_range, 'scaleanchor': 'x', 'scaleratio': 1}
     figure.styled(480, {'title': 'x [m]', 'range': x_range}, along)
     yield Section(
         'Map',
         'Seen from above: the way of the vehicle, and where each track has its obstacle.',
-        figure if origin is None else in_degrees(figure, origin),
+        figure if origin is None else plot.in_degrees(figure, origin),
     )
-
-
-def _truths(found: Matching | None, truth: Sequence[TruePath]) -> dict[int, TruePath]:
-    """The obstacle that each track was matched with last."""
-    if found is None:
-        return {}
-    tracks = found.series.track_id[found.row].tolist()
-    return {track: truth[target] for track, target in zip(tracks, found.target.tolist())}
 
 
 def _by_track(series: Series) -> Iterator[tuple[str, str, Series]]:
     for order, track_id in enumerate(np.unique(series.track_id).tolist()):
         rows = series.pick(series.track_id == track_id)
-        yield f'track {track_id}', COLOURS[order % len(COLOURS)], rows
+        yield f'track {track_id}', plot.COLOURS[order % len(plot.COLOURS)], rows
 
 
 def offset_figure(series: Series, truths: dict[int, TruePath], gap: float) -> Picture:
@@ -166,7 +150,7 @@ def offset_figure(series: Series, truths: dict[int, TruePath], gap: float) -> Pi
         figure.line(near, track.state[:, 2], name, colour, legendgroup=name)
         if (path := truths.get(int(track.track_id[0]))) is not None:
             seen = path.at(track.stamp_ns, gap)
-            figure.add_scatter(x=seen[:, 0], y=seen[:, 2], mode='lines', line=TRUTH, **hidden)
+            figure.add_scatter(x=seen[:, 0], y=seen[:, 2], mode='lines', line=plot.TRUTH, **hidden)
     y = {'title': 'below the sonar [m]', 'autorange': 'reversed'}
     return figure.styled(440, NEARING, y)
 
@@ -178,13 +162,13 @@ def image_figure(
     figure = Picture()
     if pings:
         echoes = np.concatenate([np.column_stack([ping.range, ping.bearing]) for ping in pings])
-        shown = level(echoes[thin(len(echoes), MOST_POINTS)])
-        figure.points(-shown[:, 1], shown[:, 0], 'detections', GREY, 3)
+        shown = level(echoes[plot.thin(len(echoes), plot.MOST_POINTS)])
+        figure.points(-shown[:, 1], shown[:, 0], 'detections', plot.GREY, 3)
         figure.data[-1].hoverinfo = 'skip'
     for path in truths:
         flat = level(path.seen[path.in_beam])
         legend: dict[str, Any] = {'legendgroup': 'truth', 'showlegend': path is truths[0]}
-        figure.line(-flat[:, 1], flat[:, 0], 'truth', INK, line=TRUTH, **legend)
+        figure.line(-flat[:, 1], flat[:, 0], 'truth', plot.INK, line=plot.TRUTH, **legend)
     for name, colour, track in _by_track(series):
         flat = level(track.state)
         figure.line(-flat[:, 1], flat[:, 0], name, colour)
@@ -204,10 +188,10 @@ def error_figure(found: Matching) -> Picture:
     """Error of the offset over its stated standard deviation, against the range."""
     sigmas = found.error[:, 2] / np.sqrt(found.series.covariance[found.row, 2, 2])
     figure = Picture()
-    look = {'fillcolor': AMBER, 'opacity': 0.2, 'line_width': 0}
+    look = {'fillcolor': plot.AMBER, 'opacity': 0.2, 'line_width': 0}
     figure.add_hrect(y0=-1.645, y1=1.645, annotation_text='9 in 10 should lie here', **look)
     name = 'error / stated sigma'
-    figure.points(found.truth[:, 0], sigmas, name, COLOURS[0], opacity=0.6)
+    figure.points(found.truth[:, 0], sigmas, name, plot.COLOURS[0], opacity=0.6)
     return figure.styled(320, NEARING, {'title': 'offset error / sigma'})
 
 
@@ -216,14 +200,14 @@ def calibration_figure(bins: Mapping[str, Mapping[str, float]]) -> Picture:
     is the number of forecasts."""
     stated, came, n = ([b[name] for b in bins.values()] for name in ('stated', 'came_true', 'n'))
     figure = Picture()
-    figure.line([0, 1], [0, 1], 'as stated', INK, line=TRUTH)
+    figure.line([0, 1], [0, 1], 'as stated', plot.INK, line=plot.TRUTH)
     figure.add_scatter(
         x=stated,
         y=came,
         mode='lines+markers',
         name='happened',
         text=[f'{count} forecasts' for count in n],
-        line={'color': COLOURS[0]},
+        line={'color': plot.COLOURS[0]},
         marker={'size': [6.0 + 18.0 * (count / max(n)) ** 0.5 for count in n]},
     )
     x = {'title': 'stated probability', 'range': [-0.03, 1.03]}

@@ -33,15 +33,7 @@ from sonar_imm.parameters import parameter
 from sonar_imm.truth import Received, Scene, TrueTrack
 
 from ..scenario import delay_ns, Scenario, Scenarios, stamps_of
-from .fixes import (
-    crossing_paths,
-    instruments_of_places,
-    instruments_of_scans,
-    namespace_of,
-    sense_from_vessel,
-    sense_geodetic,
-    sense_scan,
-)
+from . import fixes as located
 
 MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still', 'crossing')
 SENSORS = ('polar', 'positions', 'multistatic_fixes', 'arrivals', 'scans', 'geodetic', 'usbl')
@@ -141,8 +133,10 @@ class DiverScenario(Scenario):
 
     def instruments(self) -> dict[str, Any]:
         if self.sensor in ('geodetic', 'usbl'):
-            return instruments_of_places(self)
-        return instruments_of_scans(self) if self.sensor == 'scans' else super().instruments()
+            return located.instruments_of_places(self)
+        if self.sensor == 'scans':
+            return located.instruments_of_scans(self)
+        return super().instruments()
 
 
 MULTISTATIC = {
@@ -208,7 +202,7 @@ def simulate(config: DiverScenario, seed: int) -> Scene:
     stamps = stamps_of(times)
     turn = rng.uniform(0.0, 2.0 * np.pi) if config.random_rotation else 0.0
     if config.motion == 'crossing':
-        paths = crossing_paths(config.divers, times, rng)
+        paths = located.crossing_paths(config.divers, times, rng)
     else:
         paths = [_path(config, times, diver, turn, rng) for diver in range(config.divers)]
     errors = draw_errors(config, times, np.random.default_rng([seed, 1]))
@@ -222,7 +216,7 @@ def simulate(config: DiverScenario, seed: int) -> Scene:
         when = int(stamp) + delay_ns(config, LATE_DELAY, rng)
         scan = Scan(config, errors.at(k), int(stamp), present, rng)
         for measurement in SENSE[config.sensor](scan):
-            received.append(Received(when, measurement, namespace_of(measurement)))
+            received.append(Received(when, measurement, located.namespace_of(measurement)))
     received.sort(key=lambda item: item.received_ns)
     return Scene(tuple(received), truth)
 
@@ -427,7 +421,7 @@ SENSE: dict[str, Callable[..., Iterable[Any]]] = {
     'positions': _sense_positions,
     'arrivals': _sense_arrivals,
     'multistatic_fixes': _sense_multistatic_fixes,
-    'geodetic': sense_geodetic,
-    'usbl': sense_from_vessel,
-    'scans': sense_scan,
+    'geodetic': located.sense_geodetic,
+    'usbl': located.sense_from_vessel,
+    'scans': located.sense_scan,
 }

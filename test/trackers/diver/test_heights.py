@@ -52,8 +52,8 @@ def spatial(variance, *across):
     return covariance
 
 
-def fix(second, z, covariance, x=0.0, y=0.0):
-    return Fix(stamp_ns=round(second * SECOND), position=(x, y, z), covariance=covariance)
+def fix(second, z, covariance, x=0.0, y=0.0, **more):
+    return Fix(stamp_ns=round(second * SECOND), position=(x, y, z), covariance=covariance, **more)
 
 
 def scan(second, places, covariance):
@@ -475,7 +475,7 @@ def bearing_of(second, place, rng):
 
 DECIDING = {
     'receiver': lambda *at: transponders(*at, 3), 'bearing': bearing_of,
-    'fix': lambda second, place, _: fix(second, 0.0, np.eye(2), *place),
+    'fix': lambda second, place, _: fix(second, 0.0, np.eye(2), *place, frame_id='map'),
 }  # fmt: skip
 
 

@@ -269,8 +269,7 @@ def test_stamps_that_are_late_are_found_and_said(target, speed, std):
     rmse, nees, tracker = scored(items, truth, first=60, target=target)
     due, _, _ = scored([i for i in items if i.sensor == 'a'], truth[::2], first=30, target=target)
     assert rmse < 1.1 * due and nees < 3.0
-    (said,) = tracker.warnings()
-    assert 'stamps of sensor b are 2 s late (1)' in said
+    assert any('stamps of sensor b are 2 s late (1)' in text for text in tracker.warnings())
     off, *_, blind = scored(items, truth, first=60, target=target, sensor_delays=())
     assert off > 1.3 * rmse and not any('late' in text for text in blind.warnings())
 
