@@ -21,7 +21,7 @@ import re
 import sys
 from typing import NamedTuple
 
-from helpers.field_files import text_of
+from helpers.field_files import measured, text_of
 from helpers.sonar_files import write_segy
 import numpy as np
 import pytest
@@ -29,18 +29,9 @@ import pytest
 from msg_adapters.fixes import write_fix, write_geodetic, write_relative
 from msg_adapters.navigation import write_heading, write_navigation
 from sonar_imm.acoustics.geodesy import Origin
-from sonar_imm.measurements import (
-    Fix,
-    Navigation,
-    RelativeFix,
-    VesselFix,
-    VesselHeading,
-    VesselPose,
-)
+from sonar_imm.measurements import Fix, Navigation, RelativeFix, VesselFix, VesselHeading
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.messages import ros_message
-from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.writer import BagWriter
 
 TEST = Path(__file__).resolve().parents[1]
@@ -55,11 +46,11 @@ ELSEWHERE = [
     'recordings/test_columns.py columns_that_are_zero_throughout_give_way_to_filled_ones',
     'recordings/test_csv_table.py forms_of_dates_and_times',
     'msg_adapters/test_fixes.py latitude_0_longitude_0_is_no_fix',
-    'cli/test_info.py a_type_that_nobody_hears_names_what_would_do',
+    'cli/test_pipeline.py a_type_that_nobody_hears_names_what_would_do',
     'cli/test_names.py any_locale_will_do',
-    'cli/test_stranger.py a_recording_keeps_no_files_and_changes_no_node',
+    'cli/test_names.py a_recording_keeps_no_files_and_changes_no_node',
     'trackers/test_state.py a_file_runs_no_program',
-    'cli/test_stranger.py a_file_that_a_recording_names_lies_beside_it',
+    'cli/test_names.py a_file_that_a_recording_names_lies_beside_it',
     'recordings/convert/test_segy_headers.py the_recording_delay_of_each_trace',
     'recordings/convert/test_segy_headers.py the_sample_interval_of_each_trace_or_of_the_file',
     'recordings/convert/test_segy_headers.py local_times_ask_for_their_zone',
@@ -68,7 +59,7 @@ ELSEWHERE = [
     'recordings/convert/test_segy_headers.py places_are_used_or_the_sentence_says_why_not',
     'recordings/convert/test_segy_headers.py a_file_without_a_whole_trace_is_one_sentence',
     'recordings/convert/test_archives.py places_and_attitude_of_each_ping_become_navigation',
-    'cli/test_export.py xyz_las_and_tif_hold_the_same_floor',
+    'cli/test_field_files.py xyz_las_and_tif_hold_the_same_floor',
     'cli/test_damaged_lines.py soundings_far_away_are_left_out_and_said',
     'cli/test_damaged_lines.py '
     'each_damaged_line_is_named_and_left_out_and_the_chart_is_that_of_the_others',
@@ -137,12 +128,11 @@ def ns(t):
 def two_sensors(path, apart=5.0, count=200, seed=3):
     """A bag of fixes of two sensors in turn, of which one is `apart` off."""
     rng = np.random.default_rng(seed)
+    stated = {'covariance': 0.25 * np.eye(2), 'frame_id': 'map'}
     with BagWriter(path) as bag:
         for k in range(count):
             x, y = swim(k) + 0.5 * rng.normal(size=2) + [0.0, apart * (k % 2)]
-            fix = Fix(
-                stamp_ns=ns(k), position=(x, y, 0.0), covariance=0.25 * np.eye(2), frame_id='map'
-            )
+            fix = Fix(stamp_ns=ns(k), position=(x, y, 0.0), **stated)
             bag.write('/fix', write_fix(fix, ros_message), ns(k))
 
 
@@ -153,16 +143,14 @@ def seen_from(t):
 
 def by_vessel(path, nav, count=80, seed=4):
     """A bag of relative fixes of a vessel with the bow east; nav(bag, k) writes its pose."""
-    rng = np.random.default_rng(seed)
+    rng, stated = np.random.default_rng(seed), {'covariance': 0.09 * np.eye(3), 'frame_id': 'usbl'}
     with BagWriter(path) as bag:
         for k in range(count):
             nav(bag, k)
             if k:
                 t = k - 0.5
                 offset = (*(seen_from(t) - [t, 0] + 0.3 * rng.normal(size=2)), -4.0)
-                fix = RelativeFix(
-                    stamp_ns=ns(t), offset=offset, covariance=0.09 * np.eye(3), frame_id='usbl'
-                )
+                fix = RelativeFix(stamp_ns=ns(t), offset=offset, **stated)
                 bag.write('/relative', write_relative(fix, ros_message), ns(t))
 
 
@@ -170,10 +158,8 @@ def odometry(variances):
     """nav of `by_vessel`: exact poses that state these variances of roll, pitch and yaw, rad^2."""
 
     def nav(bag, k):
-        pose = VesselPose(
-            stamp_ns=ns(k), position=[float(k), 0.0, 0.0], orientation=EAST, frame_id='odom'
-        )
-        message = write_navigation(pose, ros_message)
+        place = {'position': [float(k), 0.0, 0.0], 'orientation': EAST, 'frame_id': 'odom'}
+        message = write_navigation(Navigation(stamp_ns=ns(k), **place), ros_message)
         message.pose.covariance[:] = np.diag([0.25, 0.25, 0.25, *variances]).ravel()
         bag.write('/nav', message, ns(k))
 
@@ -184,14 +170,9 @@ def satellite(every):
     """nav of `by_vessel`: places on Earth, each `every`-th at 0, 0 with a fix, and the heading."""
 
     def nav(bag, k):
-        latitude, longitude, _ = (
-            (0.0, 0.0, 0.0)
-            if k % every == every // 2
-            else PLACE.geodetic(np.array([float(k), 0.0, 0.0]))
-        )
-        fix = VesselFix(
-            stamp_ns=ns(k), latitude=float(latitude), longitude=float(longitude), frame_id='gps'
-        )
+        place = map(float, PLACE.geodetic(np.array([float(k), 0.0, 0.0])))
+        latitude, longitude, _ = (0.0, 0.0, 0.0) if k % every == every // 2 else place
+        fix = VesselFix(stamp_ns=ns(k), latitude=latitude, longitude=longitude, frame_id='gps')
         bag.write('/nav_fix', write_geodetic(fix, ros_message), ns(k))
         heading = VesselHeading(stamp_ns=ns(k), orientation=EAST, frame_id='vessel')
         bag.write('/heading', write_heading(heading, ros_message), ns(k))
@@ -213,14 +194,11 @@ def swim_past(bag, seconds, turning=0.0):
     for k in range(10 * seconds):
         x, yaw = pose(k / 10)
         odometry = Navigation(
-            stamp_ns=ns(k / 10),
-            position=(x, 0.0, -5.0),
+            stamp_ns=ns(k / 10), position=(x, 0.0, -5.0), frame_id='odom',
             orientation=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
             velocity=(0.5 * math.cos(yaw), -0.5 * math.sin(yaw), 0.0),
-            turn_rate=(0.0, 0.0, turning / 8 * math.cos(k / 80)),
-            frame_id='odom',
-            child_frame_id='base_link',
-        )
+            turn_rate=(0.0, 0.0, turning / 8 * math.cos(k / 80)), child_frame_id='base_link',
+        )  # fmt: skip
         bag.write('/odom', write_navigation(odometry, ros_message), ns(k / 10))
 
     def seen(t):
@@ -263,10 +241,9 @@ def pictures(path, sector_deg, seconds=20, rows=160, far=40.0, seed=19):
         seen = swim_past(bag, seconds)
         for k in range(2 * seconds):
             distance, bearing = seen(k / 2)
-            away = np.hypot(
-                ahead - distance * math.cos(bearing), port - distance * math.sin(bearing)
-            )
-            pixels = rng.rayleigh(12, dark.shape) + 230 * np.exp(-((away / 0.4) ** 2))
+            x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+            near = np.exp(-((np.hypot(ahead - x, port - y) / 0.4) ** 2))
+            pixels = rng.rayleigh(12, dark.shape) + 230 * near
             image = ros_message(
                 'sensor_msgs/msg/Image', header=header(k / 2, 'sonar'), height=rows, width=width,
                 encoding='mono8', is_bigendian=0, step=width,
@@ -359,17 +336,15 @@ def keeps_numbers_apart(run):
 
 
 def reflections(folder):
-    rng = np.random.default_rng(6)
-    late, left = set(), 0
+    rng, late, left = np.random.default_rng(6), set(), 0
     for k in range(20, 240):
         left = left - 1 if left else 6 if rng.random() < 0.05 else 0
         late |= {k} if left else set()
-    dive(
-        folder,
-        240,
-        offset=lambda k: [rng.uniform(15, 40), rng.uniform(-5, 5)] if k in late else [0.0, 0.0],
-        step=2.0,
-    )
+
+    def offset(k):
+        return [rng.uniform(15, 40), rng.uniform(-5, 5)] if k in late else [0.0, 0.0]
+
+    dive(folder, 240, offset=offset, step=2.0)
 
 
 def held(folder):
@@ -398,11 +373,8 @@ def polled(folder):
 
 
 def odd_waypoint(folder):
-    points = ''.join(
-        f'<trkpt lat="43.3" lon="{5.3 + 1e-5 * k:.6f}"><time>2021-01-01T00:00:{k:02d}</time>'
-        '</trkpt>'
-        for k in range(50)
-    )
+    point = '<trkpt lat="43.3" lon="{:.6f}"><time>2021-01-01T00:00:{:02d}</time></trkpt>'
+    points = ''.join(point.format(5.3 + 1e-5 * k, k) for k in range(50))
     (folder / 'track.gpx').write_text(
         '<gpx xmlns="http://www.topografix.com/GPX/1/1"><wpt lat="43.3" lon="5.3"/>'
         f'<trk><trkseg>{points}</trkseg></trk></gpx>'
@@ -410,13 +382,11 @@ def odd_waypoint(folder):
 
 
 def moving_vessel(folder):
-    head = 'Tid (UTC);Båt bredde;Båt lengde;Kurs;Navn;Avstand [m];Peiling [°];Dybde'
-    rows = [
-        f'{TEXT(BEGIN + k, 0)};43,31{k:04d};5,36;{80 + k % 9},5;Ola;{40 + 0.5 * k:.1f};{k}'
-        ';3,0'.replace('.', ',')
-        for k in range(60)
-    ]
-    (folder / 'usbl.csv').write_text('\n'.join([head, *rows]) + '\n', encoding='utf-8')
+    rows = ['Tid (UTC);Båt bredde;Båt lengde;Kurs;Navn;Avstand [m];Peiling [°];Dybde']
+    for k in range(60):
+        cells = f'43,31{k:04d};5,36;{80 + k % 9},5;Ola;{40 + 0.5 * k:.1f};{k};3,0'
+        rows.append(f'{TEXT(BEGIN + k, 0)};{cells}'.replace('.', ','))
+    (folder / 'usbl.csv').write_text('\n'.join(rows) + '\n', encoding='utf-8')
 
 
 def commas(folder):
@@ -426,24 +396,20 @@ def commas(folder):
 
 def flagged(folder):
     """A German table in the letters of Windows, of which every tenth row is bad and 60 m off."""
-    rng, rows = np.random.default_rng(11), []
+    rng = np.random.default_rng(11)
+    rows = ['Zeitstempel;Name;Breitengrad;Längengrad;Standardabweichung [m];Status']
     for k in range(200):
-        bad = k % 10 == 5
+        bad, time = k % 10 == 5, TEXT(BEGIN + 2 * k, 0, '%d.%m.%Y %H:%M:%S')
         x, y = swim(2 * k) + rng.normal(size=2) + (60 if bad else 0)
         latitude, longitude, _ = PLACE.geodetic(np.array([x, y, 0.0]))
         cells = f'{latitude:.7f};{longitude:.7f};1.0'.replace('.', ',')
-        rows.append(
-            f'{TEXT(BEGIN + 2 * k, 0, "%d.%m.%Y %H:%M:%S")};Müller;{cells};'
-            f'{"Fehler" if bad else "OK"}'
-        )
-    head = 'Zeitstempel;Name;Breitengrad;Längengrad;Standardabweichung [m];Status'
-    (folder / 'taucher.csv').write_text('\n'.join([head, *rows]) + '\n', 'cp1252')
+        rows.append(f'{time};Müller;{cells};{"Fehler" if bad else "OK"}')
+    (folder / 'taucher.csv').write_text('\n'.join(rows) + '\n', 'cp1252')
 
 
 def are_the_good_ones(run):
     """180 fixes of 1 m, all within 8 m of the way."""
-    with BagReader('b') as bag:
-        scans = [item.measurement for item in measurements_of(bag, 'diver', {'/fixes': 'fixes'})]
+    scans = measured('b', topics={'/fixes': 'fixes'})
     places = np.concatenate([scan.position[:, :2] for scan in scans])
     way = np.array([swim(1e-9 * scan.stamp_ns - BEGIN) for scan in scans])
     away = np.linalg.norm(places - places[0] - way + way[0], axis=1)
@@ -460,10 +426,8 @@ def knows_the_obstacle(run):
 def profile(folder):
     """60 traces of a flat floor at 12 m, 30 dB over a noisy water column, and two layers."""
     rng, t, k = np.random.default_rng(12), np.arange(600) * 60e-6, np.arange(60)
-    layers = sum(
-        a * np.exp(-0.5 * ((t - at) / 2e-4) ** 2)
-        for at, a in ((0.016, 1000.0), (0.021, 500.0), (0.029, 300.0))
-    )
+    echoes = {0.016: 1000.0, 0.021: 500.0, 0.029: 300.0}
+    layers = sum(a * np.exp(-0.5 * ((t - at) / 2e-4) ** 2) for at, a in echoes.items())
     write_segy(
         folder / 'line.sgy', layers + rng.rayleigh(30.0, (60, 600)), 5, TRACE_SAMPLE_INTERVAL=60,
         YearDataRecorded=2021, DayOfYear=60, HourOfDay=10, SecondOfMinute=k // 4,
@@ -472,17 +436,12 @@ def profile(folder):
 
 def has_no_ghosts(run):
     """No horizon more than 1 m above the floor in 5 % of the traces; the floor itself in 90 %."""
-    with open('run/estimate.csv') as file:
-        rows = list(csv.DictReader(file))
-    traces = {row['stamp_ns'] for row in rows}
-    surely = [row for row in rows if float(row['existence']) > 0.5]
-    above = {row['stamp_ns'] for row in surely if float(row['depth']) < 11.0}
-    floor = {
-        row['stamp_ns']
-        for row in surely
-        if abs(float(row['depth']) - 12.0) < 0.4 and float(row['is_bottom']) > 0.9
-    }
-    return len(traces) > 50 and len(above) < 3 and len(floor) > 54
+    table = np.genfromtxt('run/estimate.csv', delimiter=',', names=True)
+    stamps, depth, surely = table['stamp_ns'], table['depth'], table['existence'] > 0.5
+    floor = surely & (abs(depth - 12.0) < 0.4) & (table['is_bottom'] > 0.9)
+    above = surely & (depth < 11.0)
+    traces, ghosts, hits = (len(set(each)) for each in (stamps, stamps[above], stamps[floor]))
+    return traces > 50 and ghosts < 3 and hits > 54
 
 
 def attitude(*variances):
@@ -557,25 +516,19 @@ def test_a_case_is_right_or_asked(case, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     case.make(tmp_path)
     codes = [main(command.split()) for command in case.commands]
-    printed = capsys.readouterr()
-    rows = []
+    words, rows = ''.join(capsys.readouterr()), []
     if (table := tmp_path / 'run' / 'estimate.csv').exists():
         with table.open() as file:
             rows = [row for row in csv.DictReader(file) if row.get('track_state') in ('1', '2')]
+
+    def values(*names):
+        return np.array([[float(row[name]) for name in names] for row in rows])
+
     columns = ('cov_px_px', 'cov_px_py', 'cov_px_py', 'cov_py_py')
-    run = Run(
-        codes,
-        printed.out + printed.err,
-        np.array([int(row['stamp_ns']) * 1e-9 - BEGIN for row in rows]),
-        np.array([[float(row['px']), float(row['py'])] for row in rows]).reshape(-1, 2),
-        np.array(
-            [
-                [float(row[name]) for name in (columns if columns[0] in row else PLACES)]
-                for row in rows
-            ]
-        ).reshape(-1, 2, 2),
-        np.array([int(row['track_id']) for row in rows]),
-    )
+    columns = PLACES if rows and columns[0] not in rows[0] else columns
+    t = np.array([int(row['stamp_ns']) * 1e-9 - BEGIN for row in rows])
+    place, covariance = values('px', 'py').reshape(-1, 2), values(*columns).reshape(-1, 2, 2)
+    run = Run(codes, words, t, place, covariance, values('track_id').ravel())
     assert case.right(run), run.words
 
 

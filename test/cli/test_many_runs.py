@@ -30,6 +30,10 @@ EXACT = tuple(word for name in STATED for word in ('--set', f'{name}=0'))
 """What a simulated recording says of its array; a copy under other names says nothing."""
 
 
+SIDES = {'port': 'PORT', 'starboard': 'stbd'}
+"""Sides, and words for them."""
+
+
 @pytest.fixture(scope='module')
 def swaths(tmp_path_factory):
     """A short recording of a sonar with two sides."""
@@ -43,7 +47,7 @@ def renamed(bag, out, names):
     """The recording `bag` with other names of topics; those that are not named are left out."""
     with BagReader(bag) as reader, BagWriter(out) as writer:
         for item in reader.messages():
-            for name in names.get(item.topic, ()):
+            for name in names.get(item.topic, '').split():
                 writer.write(name, item.message, item.log_ns)
     return out
 
@@ -51,61 +55,51 @@ def renamed(bag, out, names):
 @pytest.fixture
 def two_ships(swaths, tmp_path):
     """Two sonars of two sides each, one of them with topics named by words."""
-    return renamed(
-        swaths,
-        tmp_path / 'two_ships',
-        {
-            '/port/snapshot': ('/fore/port/snapshot', '/aft/sidescan_port/snapshot'),
-            '/starboard/snapshot': ('/fore/starboard/snapshot', '/aft/sidescan_stbd/snapshot'),
-            '/truth/port/estimate': ('/truth/fore/port/estimate',),
-            '/truth/starboard/estimate': ('/truth/fore/starboard/estimate',),
-        },
-    )
+    names = {f'/truth/{side}/estimate': f'/truth/fore/{side}/estimate' for side in SIDES}
+    for side, word in SIDES.items():
+        names[f'/{side}/snapshot'] = f'/fore/{side}/snapshot /aft/sidescan_{word}/snapshot'
+    return renamed(swaths, tmp_path / 'two_ships', names)
 
 
 def made_in(folder):
     return contents(folder, 'run.json', 'summary.json')
 
 
+def entries(file):
+    return json.loads(file.read_text())
+
+
 def track(*arguments):
     return main(['track', *map(str, arguments)])
 
 
+@pytest.fixture
+def dives(tmp_path):
+    """Recordings a, b and c."""
+    return [write_dive(tmp_path / name, count=30, spoilt=range(k)) for k, name in enumerate('abc')]
+
+
 def test_words_in_a_name_tell_the_side(swaths, tmp_path):
-    bag = renamed(
-        swaths,
-        tmp_path / 'bag',
-        {
-            '/port/snapshot': ('/sidescan_PORT/snapshot',),
-            '/starboard/snapshot': ('/sidescan_stbd/snapshot',),
-        },
-    )
+    names = {f'/{side}/snapshot': f'/sidescan_{word}/snapshot' for side, word in SIDES.items()}
+    bag = renamed(swaths, tmp_path / 'bag', names)
     with BagReader(bag) as reader:
         named = {name: entry.name for name, entry in fitting_topics(reader, 'bathymetry').items()}
     assert named == {
-        '/sidescan_PORT/snapshot': 'port/snapshot',
-        '/sidescan_stbd/snapshot': 'starboard/snapshot',
-    }
+        '/sidescan_PORT/snapshot': 'port/snapshot', '/sidescan_stbd/snapshot': 'starboard/snapshot'
+    }  # fmt: skip
     assert track(bag, tmp_path / 'words', *EXACT) == 0 == track(swaths, tmp_path / 'own', *EXACT)
     assert made_in(tmp_path / 'words') == made_in(tmp_path / 'own')
 
 
 def test_instruments_are_told_apart_and_share_what_is_nobodys(tmp_path):
-    bag = renamed(
-        ROOT / 'bags' / 'bathymetry_ship',
-        tmp_path / 'bag',
-        {
-            '/nav': ('/nav', '/b/nav'),
-            '/port/snapshot': ('/a/snapshot', '/b/snapshot', '/snapshot'),
-        },
-    )
+    names = {'/nav': '/nav /b/nav', '/port/snapshot': '/a/snapshot /b/snapshot /snapshot'}
+    bag = renamed(ROOT / 'bags' / 'bathymetry_ship', tmp_path / 'bag', names)
     with BagReader(bag) as reader:
         found = instruments(reader, 'bathymetry')
     assert {name: sorted(inputs) for name, inputs in found.items()} == {
-        'a': ['/a/snapshot', '/nav'],
-        'b': ['/b/nav', '/b/snapshot'],
+        'a': ['/a/snapshot', '/nav'], 'b': ['/b/nav', '/b/snapshot'],
         'snapshot': ['/nav', '/snapshot'],
-    }
+    }  # fmt: skip
 
 
 def test_every_instrument_is_tracked_as_if_it_were_alone(swaths, two_ships, tmp_path, capsys):
@@ -115,114 +109,99 @@ def test_every_instrument_is_tracked_as_if_it_were_alone(swaths, two_ships, tmp_
     assert track(swaths, tmp_path / 'alone', *EXACT) == 0
     alone = made_in(tmp_path / 'alone')
     assert made_in(out / 'fore') == made_in(out / 'aft_sidescan') == alone
-    summary = json.loads((out / 'summary.json').read_text())
-    assert [run['folder'] for run in summary['runs']] == ['aft_sidescan', 'fore']
-    assert all(run['estimates'] == 6 and run['state'] == 'tracked' for run in summary['runs'])
-    topics = json.loads((out / 'fore' / 'run.json').read_text())['topics']
-    assert topics == {
-        '/fore/port/snapshot': 'port/snapshot',
-        '/fore/starboard/snapshot': 'starboard/snapshot',
-    }
+    runs = entries(out / 'summary.json')['runs']
+    assert [run['folder'] for run in runs] == ['aft_sidescan', 'fore']
+    assert all(run['estimates'] == 6 and run['state'] == 'tracked' for run in runs)
+    topics = {f'/fore/{side}/snapshot': f'{side}/snapshot' for side in SIDES}
+    assert entries(out / 'fore' / 'run.json')['topics'] == topics
     # Downstream: all at once, one by one, and a sentence where only one will do.
     capsys.readouterr()
     assert main(['evaluate', str(out), '--json']) == 0
     metrics = json.loads(capsys.readouterr().out)
     assert list(metrics) == ['aft_sidescan', 'fore'] and (out / 'report.html').is_file()
-    assert metrics['fore'] == json.loads((out / 'fore' / 'metrics.json').read_text())
+    assert metrics['fore'] == entries(out / 'fore' / 'metrics.json')
     assert main(['evaluate', str(out / 'fore'), '--no-report']) == 0
     assert main(['export', str(out), str(tmp_path / 'x.xyz')]) == 2
     assert 'holds several runs' in capsys.readouterr().err
-
-
-def test_a_named_topic_is_tracked_alone(two_ships, tmp_path):
+    # A topic that is named is tracked alone.
     chosen = ('--topic', 'port/snapshot=/fore/port/snapshot')
-    assert track(two_ships, tmp_path / 'out', *EXACT, *chosen) == 0
-    run = json.loads((tmp_path / 'out' / 'run.json').read_text())
-    assert run['topics'] == {'/fore/port/snapshot': 'port/snapshot'}
+    assert track(two_ships, tmp_path / 'one', *EXACT, *chosen) == 0
+    topics = entries(tmp_path / 'one' / 'run.json')['topics']
+    assert topics == {'/fore/port/snapshot': 'port/snapshot'}
 
 
-def test_the_same_command_again_makes_only_what_is_missing(tmp_path, capsys):
-    bags = [write_dive(tmp_path / name, count=30, spoilt=range(k)) for k, name in enumerate('abc')]
+def test_the_same_command_again_makes_only_what_is_missing(dives, tmp_path, capsys):
     out = tmp_path / 'out'
-    assert track(*bags, out) == 0
-    first, times = made_in(out), {path: path.stat().st_mtime_ns for path in out.rglob('*.csv')}
-    (out / 'a' / 'run.json').unlink()  # as if killed
-    (out / 'c' / 'estimate.csv').unlink()
-    (out / 'c' / 'run.json').unlink()
+    assert track(*dives, out) == 0
+    first, kept = made_in(out), (out / 'b' / 'estimate.csv').stat().st_mtime_ns
+    for name in ('a/run.json', 'c/estimate.csv', 'c/run.json'):  # as if killed
+        (out / name).unlink()
     capsys.readouterr()
-    assert track(*bags, out, '--json', '--jobs', '2') == 0
+    assert track(*dives, out, '--json', '--jobs', '2') == 0
     states = [run['state'] for run in json.loads(capsys.readouterr().out)['runs']]
-    assert states == ['tracked', 'kept', 'tracked']
-    assert made_in(out) == first
-    assert (out / 'b' / 'estimate.csv').stat().st_mtime_ns == times[out / 'b' / 'estimate.csv']
+    assert states == ['tracked', 'kept', 'tracked'] and made_in(out) == first
+    assert (out / 'b' / 'estimate.csv').stat().st_mtime_ns == kept
     # Another parameter, another recording, another version: refused, and by --overwrite made anew.
-    assert track(*bags, out, '--set', 'detection_probability=0.8') == 1
-    assert 'b holds another run, which differs in parameters (detection_probability)' in (
-        capsys.readouterr().err
-    )
-    run = json.loads((out / 'b' / 'run.json').read_text())
+    other = ('--set', 'detection_probability=0.8')
+    assert track(*dives, out, *other) == 1
+    differs = 'holds another run, which differs in'
+    assert f'b {differs} parameters (detection_probability)' in capsys.readouterr().err
+    run = entries(out / 'b' / 'run.json')
     run['versions']['sonar_imm'] = '0.0.1'
     (out / 'b' / 'run.json').write_text(json.dumps(run))
-    assert track(*bags, out) == 1
-    assert 'b holds another run, which differs in versions (sonar_imm)' in capsys.readouterr().err
-    assert track(*bags, out, '--overwrite', '--set', 'detection_probability=0.8') == 0
+    assert track(*dives, out) == 1
+    assert f'b {differs} versions (sonar_imm)' in capsys.readouterr().err
+    assert track(*dives, out, '--overwrite', *other) == 0
     capsys.readouterr()
-    (bags[0] / 'notes.txt').write_text('one byte more')
-    assert track(*bags, out, '--set', 'detection_probability=0.8') == 1
+    (dives[0] / 'notes.txt').write_text('one byte more')
+    assert track(*dives, out, *other) == 1
     output = capsys.readouterr()
-    assert 'a holds another run, which differs in bag_bytes, bag_sha256' in output.err
+    assert f'a {differs} bag_bytes, bag_sha256' in output.err
     assert '3 runs in' in output.out and '2 kept, 1 failed' in output.out
 
 
-def test_the_summary_keeps_what_other_commands_made(tmp_path, capsys):
-    a, b, c = (write_dive(tmp_path / name, count=30) for name in 'abc')
-    assert track(a, b, tmp_path / 'out') == 0 == track(b, c, tmp_path / 'out')
-    runs = json.loads((tmp_path / 'out' / 'summary.json').read_text())['runs']
-    assert [(run['folder'], run['state']) for run in runs] == [
-        ('a', 'tracked'),
-        ('b', 'kept'),
-        ('c', 'tracked'),
-    ]
-    assert main(['evaluate', str(tmp_path / 'out'), '--json', '--no-report']) == 0
+def test_the_summary_keeps_what_other_commands_made(dives, tmp_path, capsys):
+    (a, b, c), out = dives, tmp_path / 'out'
+    assert track(a, b, out) == 0 == track(b, c, out)
+    runs = entries(out / 'summary.json')['runs']
+    states = [(run['folder'], run['state']) for run in runs]
+    assert states == [('a', 'tracked'), ('b', 'kept'), ('c', 'tracked')]
+    assert main(['evaluate', str(out), '--json', '--no-report']) == 0
     capsys.readouterr()
-    assert track(a, tmp_path / 'single') == 0
-    assert track(a, b, tmp_path / 'single') == 2
+    assert track(a, tmp_path / 'single') == 0 and track(a, b, tmp_path / 'single') == 2
     assert 'holds a run itself' in capsys.readouterr().err
-    (tmp_path / 'out' / 'summary.json').write_text('{"runs": [{"folder": 3}]}')
-    assert main(['evaluate', str(tmp_path / 'out')]) == 2
+    (out / 'summary.json').write_text('{"runs": [{"folder": 3}]}')
+    assert main(['evaluate', str(out)]) == 2
     assert 'cannot be understood' in capsys.readouterr().err
 
 
-def test_bags_on_a_cluster(tmp_path, capsys):
-    bags = [write_dive(tmp_path / name, count=30, spoilt=range(k)) for k, name in enumerate('ab')]
+def test_bags_on_a_cluster(dives, tmp_path, capsys):
+    bags, out = dives[:2], tmp_path / 'there'
     assert track(*bags, tmp_path / 'here') == 0
     with small_cluster(silence_logs='CRITICAL') as there:
         address = ('--scheduler', there.scheduler_address)
-        assert track(*bags, tmp_path / 'missing', tmp_path / 'there', *address) == 1
+        assert track(*bags, tmp_path / 'missing', out, *address) == 1
         assert 'missing does not exist' in capsys.readouterr().err
-        assert made_in(tmp_path / 'there') == made_in(tmp_path / 'here')
+        assert made_in(out) == made_in(tmp_path / 'here')
         capsys.readouterr()
-        assert track(*bags, tmp_path / 'there', *address) == 0
+        assert track(*bags, out, *address) == 0
         assert '2 kept' in capsys.readouterr().out
     assert track(*bags, tmp_path / 'no', '--scheduler', 'nonsense') == 2
     assert 'no dask scheduler at nonsense' in capsys.readouterr().err
     assert track(*bags, tmp_path / 'no', *address, '--jobs', '2') == 2
 
 
-def test_shards_share_the_bags_out(tmp_path, capsys):
+def test_shards_share_the_bags_out(dives, tmp_path, capsys):
     """As a Slurm array does: each command has the same bags, in any order, and makes its share."""
-    bags = [write_dive(tmp_path / name, count=30, spoilt=range(k)) for k, name in enumerate('abc')]
-    out = tmp_path / 'out'
-    assert track(*bags[::-1], out, '--shard', '1/2') == 0
+    out, few = tmp_path / 'out', tmp_path / 'few'
+    assert track(*dives[::-1], out, '--shard', '1/2') == 0
     assert sorted(path.name for path in out.iterdir()) == ['a', 'c', 'summary-1-of-2.json']
-    assert track(*bags, out, '--shard', '2/2') == 0
+    assert track(*dives, out, '--shard', '2/2') == 0
     assert not (out / 'summary.json').exists()
-    runs = json.loads((out / 'summary-2-of-2.json').read_text())['runs']
-    assert [run['folder'] for run in runs] == ['b']
-    assert track(*bags, tmp_path / 'whole') == 0
-    assert {name: text for name, text in made_in(out).items() if 'summary' not in name} == (
-        made_in(tmp_path / 'whole')
-    )
+    assert [run['folder'] for run in entries(out / 'summary-2-of-2.json')['runs']] == ['b']
+    assert track(*dives, tmp_path / 'whole') == 0
+    made = {name: text for name, text in made_in(out).items() if 'summary' not in name}
+    assert made == made_in(tmp_path / 'whole')
     # Downstream all shards are one; a share again makes what is missing; one may be empty.
     capsys.readouterr()
     assert main(['evaluate', str(out), '--json', '--no-report']) == 0
@@ -230,55 +209,54 @@ def test_shards_share_the_bags_out(tmp_path, capsys):
     assert main(['export', str(out), str(tmp_path / 'x.csv')]) == 2
     assert 'several runs, which summary-1-of-2.json lists' in capsys.readouterr().err
     (out / 'c' / 'run.json').unlink()
-    assert track(*bags, out, '--shard', '1/2') == 0
-    assert '1 tracked, 1 kept' in capsys.readouterr().out
-    assert track(bags[0], tmp_path / 'few', '--shard', '2/3') == 0
-    assert '0 runs in' in capsys.readouterr().out
-    assert track(bags[0], tmp_path / 'few', '--shard', '1/3') == 0
-    assert (tmp_path / 'few' / 'a' / 'run.json').is_file()
-
-
-@pytest.mark.parametrize('shard', ['0/2', '3/2', '1', '1/', '-1/2', '1/2/3', 'a/b'])
-def test_a_share_that_cannot_be(tmp_path, capsys, shard):
-    assert track('a', 'b', tmp_path / 'out', '--shard', shard) == 2
-    error = capsys.readouterr().err
-    assert 'not of the form I/N' in error and 'Traceback' not in error
-    assert not (tmp_path / 'out').exists()
+    for bags, where, shard, said in (
+        (dives, out, '1/2', '1 tracked, 1 kept'),
+        (dives[:1], few, '2/3', '0 runs in'),
+        (dives[:1], few, '1/3', ''),
+    ):
+        assert track(*bags, where, '--shard', shard) == 0
+        assert said in capsys.readouterr().out
+    assert (few / 'a' / 'run.json').is_file()
+    for shard in ('0/2', '3/2', '1', '1/', '-1/2', '1/2/3', 'a/b'):
+        assert track('a', 'b', tmp_path / 'no', '--shard', shard) == 2
+        error = capsys.readouterr().err
+        assert 'not of the form I/N' in error and 'Traceback' not in error
+    assert not (tmp_path / 'no').exists()
 
 
 def test_a_folder_of_tables_becomes_a_folder_of_bags(tmp_path, capsys):
+    def convert(*words, code=0):
+        capsys.readouterr()
+        assert main(['convert', 'fixes', *map(str, words)]) == code
+        return capsys.readouterr()
+
     tables = tmp_path / 'tables'
     tables.mkdir()
-    for k, name in enumerate(('a', 'b', 'c')):
+    for k, name in enumerate('abc'):
         rows = [f'{10 + t},{k + t},{2 * t}' for t in range(4)]
         (tables / f'{name}.csv').write_text('stamp,x,y\n' + '\n'.join(rows) + '\n')
-    made = {}
     for jobs in ('1', '2'):
-        out = tmp_path / jobs
-        capsys.readouterr()
-        assert main(['convert', 'fixes', str(tables), str(out), '--jobs', jobs]) == 0
-        assert '3 bags in' in capsys.readouterr().out
-        made[jobs] = made_in(out)
-    assert made['1'] == made['2'] and {Path(name).parts[0] for name in made['1']} == set('abc')
+        assert '3 bags in' in convert(tables, tmp_path / jobs, '--jobs', jobs).out
+    made = made_in(tmp_path / '1')
+    assert made == made_in(tmp_path / '2') and {Path(name).parts[0] for name in made} == set('abc')
     # The same as one by one; one that fails is named and stops no other.
-    assert main(['convert', 'fixes', str(tables / 'b.csv'), str(tmp_path / 'b')]) == 0
+    convert(tables / 'b.csv', tmp_path / 'b')
     alone = {f'b/{name}': content for name, content in made_in(tmp_path / 'b').items()}
-    assert alone.items() <= made['1'].items()
+    assert alone.items() <= made.items()
     (tables / 'broken.csv').write_text('what\n1\n')
-    capsys.readouterr()
-    assert main(['convert', 'fixes', str(tables), str(tmp_path / 'o'), '--json']) == 1
-    found = capsys.readouterr()
+    found = convert(tables, tmp_path / 'o', '--json', code=1)
     assert found.err.startswith(str(tables / 'broken.csv')) and 'Traceback' not in found.err
-    entries = json.loads(found.out)['bags']
-    assert [Path(entry['source']).name for entry in entries if entry['failure']] == ['broken.csv']
-    assert [entry['rows'] for entry in entries if not entry['failure']] == [4, 4, 4]
+    failed, good = [], []
+    for entry in json.loads(found.out)['bags']:
+        (failed if entry['failure'] else good).append(entry)
+    assert [Path(entry['source']).name for entry in failed] == ['broken.csv']
+    assert [entry['rows'] for entry in good] == [4, 4, 4]
     (tables / 'a.txt').write_text('')
-    assert main(['convert', 'fixes', str(tables), str(tmp_path / 'p')]) == 2
-    assert 'two recordings would be converted into' in capsys.readouterr().err
     (tmp_path / 'none').mkdir()
-    assert main(['convert', 'fixes', str(tmp_path / 'none'), str(tmp_path / 'q')]) == 2
-    assert 'nothing to convert' in capsys.readouterr().err
-    assert not (tmp_path / 'p').exists() and not (tmp_path / 'q').exists()
+    for folder, words in ((tables, 'two recordings would be converted into'),
+                          (tmp_path / 'none', 'nothing to convert')):  # fmt: skip
+        assert words in convert(folder, tmp_path / 'p', code=2).err
+        assert not (tmp_path / 'p').exists()
 
 
 def test_pings_that_are_coupled_are_shared_out(swaths, tmp_path, capsys):
@@ -293,13 +271,11 @@ def test_pings_that_are_coupled_are_shared_out(swaths, tmp_path, capsys):
 
 
 def test_bags_are_shared_out_and_one_that_fails_stops_no_other(swaths, tmp_path, capsys):
-    dive, broken = write_dive(tmp_path / 'dive.bag', count=30), tmp_path / 'broken.bag'
+    dive, broken, found = write_dive(tmp_path / 'dive.bag', count=30), tmp_path / 'broken.bag', []
     broken.mkdir()
-    bags = [str(swaths), str(broken), str(dive)]
-    found = []
     for jobs in ('1', '2'):
         capsys.readouterr()
-        assert main(['track', *bags, str(tmp_path / jobs), '--jobs', jobs]) == 1
+        assert track(swaths, broken, dive, tmp_path / jobs, '--jobs', jobs) == 1
         output = capsys.readouterr()
         assert output.err.startswith(f'{broken}: ')
         assert 'Traceback' not in output.err and output.err.count('broken') == 2
@@ -307,16 +283,11 @@ def test_bags_are_shared_out_and_one_that_fails_stops_no_other(swaths, tmp_path,
     assert found[0] == found[1]
     assert {name.split('/')[0] for name in found[0][0]} == {'swaths', 'dive'}
     capsys.readouterr()
-    assert main(['track', str(swaths), str(dive), str(tmp_path / 'j'), '--json']) == 0
+    assert track(swaths, dive, tmp_path / 'j', '--json') == 0
     runs = json.loads(capsys.readouterr().out)['runs']
-    assert {run['bag']: run['system'] for run in runs} == {
-        str(swaths): 'bathymetry',
-        str(dive): 'diver',
-    }
-
-
-def test_two_bags_of_one_name_are_refused(swaths, tmp_path, capsys):
-    assert main(['track', str(swaths), str(swaths), str(tmp_path / 'out')]) == 2
+    systems = {run['bag']: run['system'] for run in runs}
+    assert systems == {str(swaths): 'bathymetry', str(dive): 'diver'}
+    assert track(swaths, swaths, tmp_path / 'out') == 2  # two of one name
     assert 'two bags would be tracked into' in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
 
@@ -326,5 +297,6 @@ def test_a_worker_that_dies_is_one_sentence(swaths, tmp_path, capsys, monkeypatc
         raise BrokenProcessPool('gone')
 
     monkeypatch.setattr(OfflineRun, '_taken', dies)
-    assert main(['track', str(swaths), str(tmp_path / 'out'), *EXACT, '--jobs', '2']) == 2
-    assert 'Traceback' not in (errors := capsys.readouterr().err) and 'lack of memory' in errors
+    assert track(swaths, tmp_path / 'out', *EXACT, '--jobs', '2') == 2
+    errors = capsys.readouterr().err
+    assert 'Traceback' not in errors and 'lack of memory' in errors

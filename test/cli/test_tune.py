@@ -8,6 +8,7 @@
 
 """What `sonar-imm tune` makes of recordings, and of what a user can get wrong."""
 
+from itertools import product
 import json
 import math
 from pathlib import Path
@@ -30,19 +31,23 @@ from sonar_imm_tools.evaluation.obstacle import predictive as obstacles
 from sonar_imm_tools.evaluation.tuning import errors, maximise, Tunable, values_of
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'regret_free'
-QUICK = ['--system', 'diver', '--set', 'model_set=linear', '--parameters', 'covariance_scale']
 
 
 def dive(folder, duration):
-    bag = folder / f'dive_{duration}.bag'
-    settings = ['--set', f'duration={duration}']
+    bag, settings = folder / f'dive_{duration}.bag', ['--set', f'duration={duration}']
     assert main(['simulate', 'diver', str(bag), '--scenario', 'straight', *settings]) == 0
     return bag
 
 
+def tune(bag, *words, model_set='linear', name='covariance_scale'):
+    """The code of `tune` of a diver."""
+    options = '--system', 'diver', '--set', f'model_set={model_set}', '--parameters', name
+    return main(['tune', str(bag), *options, *words])
+
+
 def test_a_file_is_written_where_nothing_is_determined(tmp_path, capsys):
     bag, out = dive(tmp_path, 60), tmp_path / 'tuned.yaml'
-    assert main(['tune', str(bag), *QUICK, '--set', 'fix_std=2.0', '--out', str(out)]) == 0
+    assert tune(bag, '--set', 'fix_std=2.0', '--out', str(out)) == 0
     printed = capsys.readouterr().out
     assert 'covariance_scale: not determined' in printed
     assert f'does not determine any of the parameters; {out} holds them unchanged' in printed
@@ -66,7 +71,7 @@ def wandering(folder, variance):
     return folder / 'fixes.bag'
 
 
-@pytest.mark.parametrize(('model_set', 'factor'), [('linear', 60), ('families', 1000)])
+@pytest.mark.parametrize('model_set, factor', [('linear', 60), ('families', 1000)])
 def test_covariances_that_are_far_too_small_are_found_and_written(
     tmp_path, capsys, model_set, factor
 ):
@@ -74,56 +79,45 @@ def test_covariances_that_are_far_too_small_are_found_and_written(
     stated the likelihood is no better than at one."""
     bag, out = wandering(tmp_path, 1.0 / factor), tmp_path / 'tuned.yaml'
     capsys.readouterr()
-    options = ['--system', 'diver', '--set', f'model_set={model_set}', '--json', '--out', str(out)]
-    assert main(['tune', str(bag), *options, '--parameters', 'covariance_scale']) == 0
+    assert tune(bag, '--json', '--out', str(out), model_set=model_set) == 0
     (row,) = json.loads(capsys.readouterr().out)['parameters']
     assert row['verdict'] == 'determined' and row['before'] == 1.0
     assert row['low'] < factor < row['high'] < 3.0 * row['low']
     written = yaml.safe_load(out.read_text())['/**']['ros__parameters']
-    assert written == {
-        'model_set': model_set,
-        'covariance_scale': pytest.approx(row['after'], rel=1e-3),
-    }
+    scale = pytest.approx(row['after'], rel=1e-3)
+    assert written == {'model_set': model_set, 'covariance_scale': scale}
 
 
 def test_covariances_that_are_too_large_are_said_to_be_out_of_range(tmp_path, capsys):
     """Unless the fit may begin below: then they are found."""
     bag = wandering(tmp_path, 25.0)
     capsys.readouterr()
-    assert main(['tune', str(bag), *QUICK]) == 0
+    assert tune(bag) == 0
     printed = capsys.readouterr().out
     assert 'covariance_scale: not determined, the likelihood goes on rising below 1\n' in printed
-    assert main(['tune', str(bag), *QUICK, '--set', 'covariance_scale=0.01', '--json']) == 0
+    assert tune(bag, '--set', 'covariance_scale=0.01', '--json') == 0
     (row,) = json.loads(capsys.readouterr().out)['parameters']
     assert row['verdict'] == 'determined' and row['low'] < 0.04 < row['high']
 
 
-@pytest.mark.parametrize(
-    ('duration', 'name', 'sentence'),
-    [
-        (5, 'covariance_scale', 'too little to fit'),
-        (30, 'covariance_scal', "did you mean 'covariance_scale'"),
-        (30, 'max_tracks', 'cannot be fitted'),
-    ],
-)
-def test_bad_input_is_named(tmp_path, capsys, duration, name, sentence):
-    bag = dive(tmp_path, duration)
-    options = ['--system', 'diver', '--set', 'model_set=linear']
-    assert main(['tune', str(bag), *options, '--parameters', name]) == 2
-    assert sentence in capsys.readouterr().err
+def test_bad_input_is_named(tmp_path, capsys):
+    short, bag = dive(tmp_path, 5), dive(tmp_path, 30)
+    for recording, name, sentence in (
+        (short, 'covariance_scale', 'too little to fit'),
+        (bag, 'covariance_scal', "did you mean 'covariance_scale'"),
+        (bag, 'max_tracks', 'cannot be fitted'),
+    ):
+        assert tune(recording, name=name) == 2
+        assert sentence in capsys.readouterr().err
 
 
-def test_scales_are_tried_over_their_whole_range():
+def test_scales_are_tried_over_their_whole_range_within_the_bounds_of_the_parameter():
     scale = Tunable(name='covariance_scale', start=1.0, std=3.0, least=1.0, scanned=True)
     grid = np.array(scale.grid(DiverConfig()))
     assert grid[0] == 0.0 and grid[-1] == pytest.approx(math.log(1e4))
     assert np.diff(grid).max() <= tuning.SPACING
     assert Tunable(name='covariance_scale', start=1.0).grid(DiverConfig()) == []
-
-
-def test_bounds_are_those_of_the_parameter():
-    tunable = Tunable(name='covariance_scale', start=1.0, least=1.0)
-    assert tunable.bounds(DiverConfig())[0] == 0.0
+    assert Tunable(name='covariance_scale', start=1.0, least=1.0).bounds(DiverConfig())[0] == 0.0
     stay = Tunable(name='stay_probability', start=0.9, kind='logit')
     assert stay.value(stay.coordinate(0.9)) == pytest.approx(0.9)
 
@@ -149,20 +143,16 @@ def fitting_of(peak, H):
     return SimpleNamespace(jobs=(None,), tunables=tunables, posterior=posterior)
 
 
-CORRELATED = np.array([[4.0, 3.0], [3.0, 9.0]])
-
-
 def test_standard_errors_are_those_of_the_inverse_of_the_curvature():
-    fitting = fitting_of([0.3, -0.2], CORRELATED)
-
-    def evaluate(points):
-        return [fitting.posterior(u) for u in points]
-
-    exact = np.sqrt(np.diag(np.linalg.inv(CORRELATED)))
-    assert errors(fitting, np.array([0.3, -0.2]), evaluate) == pytest.approx(exact)
-    saddle = fitting_of([0.0, 0.0], np.array([[1.0, 3.0], [3.0, 1.0]]))
-    found = errors(saddle, np.zeros(2), lambda points: [saddle.posterior(u) for u in points])
-    assert np.isinf(found).all()
+    H = np.array([[4.0, 3.0], [3.0, 9.0]])
+    saddle = np.array([[1.0, 3.0], [3.0, 1.0]])
+    for peak, curvature, exact in (
+        (np.array([0.3, -0.2]), H, np.sqrt(np.diag(np.linalg.inv(H)))),
+        (np.zeros(2), saddle, np.full(2, np.inf)),
+    ):
+        fitting = fitting_of(peak, curvature)
+        found = errors(fitting, peak, lambda points, at=fitting.posterior: [at(u) for u in points])
+        assert found == pytest.approx(exact)
 
 
 @pytest.mark.parametrize('peak', [[0.3, -0.2], [-40.0, 40.0]])
@@ -181,132 +171,115 @@ class Halves:
     of the model is the parameter speed_std."""
 
     config = DiverConfig()
-    z = np.tile([1.0, -1.0], 20) * np.repeat([3.0, 2.0], 20)
+
+    def __init__(self, first=3.0, second=2.0):
+        self.z = np.tile([1.0, -1.0], 20) * np.repeat([first, second], 20)
+
+    def terms(self, values):
+        return norm.logpdf(self.z, scale=values.get('speed_std', 1.0))
 
     def scores(self, values, until=math.inf):
-        terms = norm.logpdf(self.z, scale=values.get('speed_std', 1.0))
-        return {k: (float(term), 1) for k, term in enumerate(terms) if k <= until}
+        return {k: (float(term), 1) for k, term in enumerate(self.terms(values)) if k <= until}
 
 
-def test_what_is_gained_is_of_each_half_by_what_the_other_one_told(monkeypatch):
-    monkeypatch.setattr(tuning, '_recording', lambda job: Halves())
-    job = SimpleNamespace(system='diver')
-    fitting = tuning.Fitting(
-        jobs=(job,), tunables=(Tunable(name='speed_std', start=1.0, std=3.0),), split=(19,)
-    )
-    tuned = tuning.tune(fitting, 40)
-    first, second = Halves.z[:20], Halves.z[20:]
+@pytest.fixture
+def tuned(monkeypatch):
+    """What comes out of such numbers."""
+
+    def tuned(numbers, names=('speed_std',)):
+        monkeypatch.setattr(tuning, '_recording', lambda job: numbers)
+        tunables = tuple(
+            Tunable(name=name, start=1.0, std=3.0) for name in names or ('speed_std',)
+        )
+        job, split = SimpleNamespace(system='diver'), (len(numbers.z) // 2 - 1,)
+        return tuning.tune(tuning.Fitting(jobs=(job,), tunables=tunables, split=split), 40)
+
+    return tuned
+
+
+def test_what_is_gained_is_of_each_half_by_what_the_other_one_told(tuned):
+    numbers = Halves()
+    made = tuned(numbers)
+    first, second = numbers.z[:20], numbers.z[20:]
     gained = [
         norm.logpdf(half, scale=scale).sum() - norm.logpdf(half).sum()
         for half, scale in ((second, 3.0), (first, 2.0))
     ]
-    assert tuned.held_out_gain == pytest.approx(sum(gained) / 40, abs=0.02)
-    assert tuned.values['speed_std'] == pytest.approx(math.sqrt(6.5), abs=0.1)
-    assert tuned.log_likelihood_before == pytest.approx(norm.logpdf(Halves.z).sum())
-    (row,) = tuned.parameters
-    assert row.determined and row.low is not None and row.high is not None
-    assert row.held_out_gain == pytest.approx(tuned.held_out_gain)
+    assert made.held_out_gain == pytest.approx(sum(gained) / 40, abs=0.02)
+    assert made.values['speed_std'] == pytest.approx(math.sqrt(6.5), abs=0.1)
+    assert made.log_likelihood_before == pytest.approx(norm.logpdf(numbers.z).sum())
+    (row,) = made.parameters
+    assert row.determined and row.held_out_gain == pytest.approx(made.held_out_gain)
     # Of forty numbers a logarithm of their spread is known to the root of one eightieth.
     assert math.log(row.high / row.low) == pytest.approx(4.0 / math.sqrt(80.0), rel=0.05)
 
 
-class Changes(Halves):
-    """Numbers whose standard deviation is 1 / 3 in the first half and 3 in the second."""
-
-    z = np.tile([1.0, -1.0], 20) * np.repeat([1.0 / 3.0, 3.0], 20)
-
-
-class Right(Halves):
-    """Numbers as the model has it, but for a mean spread of 3 that only speed_noise explains."""
-
-    def scores(self, values, until=math.inf):
-        terms = norm.logpdf(np.tile([1.0, -1.0], 20), scale=values.get('speed_std', 1.0))
-        terms = terms + norm.logpdf(self.z, scale=values.get('speed_noise', 1.0))
-        return {k: (float(term), 1) for k, term in enumerate(terms) if k <= until}
-
-
-def test_without_gain_on_the_other_half_a_parameter_is_not_determined(monkeypatch):
+def test_without_gain_on_the_other_half_a_parameter_is_not_determined(tuned):
     """The whole determines a spread of 2.1, with a small standard error; each half contradicts
-    the other."""
-    monkeypatch.setattr(tuning, '_recording', lambda job: Changes())
-    job = SimpleNamespace(system='diver')
-    tunables = (Tunable(name='speed_std', start=1.0, std=3.0),)
-    tuned = tuning.tune(tuning.Fitting(jobs=(job,), tunables=tunables, split=(19,)), 40)
-    (row,) = tuned.parameters
+    the other: its standard deviation is 1 / 3 in the first one and 3 in the second."""
+    made = tuned(Halves(1.0 / 3.0, 3.0))
+    (row,) = made.parameters
     assert not row.determined and row.low is not None and 1.0 < row.low
     assert row.after == row.before == 1.0 and 'not fitted' in row.reason
-    assert tuned.values == {} and tuned.held_out_gain < 0.0
-    assert tuned.log_likelihood_after == tuned.log_likelihood_before
+    assert made.values == {} and made.held_out_gain < 0.0
+    assert made.log_likelihood_after == made.log_likelihood_before
 
 
-def test_only_parameters_with_gain_of_their_own_are_kept(monkeypatch):
-    monkeypatch.setattr(tuning, '_recording', lambda job: Right())
-    job = SimpleNamespace(system='diver')
-    names = ('speed_std', 'speed_noise')
-    tunables = tuple(Tunable(name=name, start=1.0, std=3.0) for name in names)
-    tuned = tuning.tune(tuning.Fitting(jobs=(job,), tunables=tunables, split=(19,)), 40)
-    assert list(tuned.values) == ['speed_noise']
-    first, second = tuned.parameters
+def test_only_parameters_with_gain_of_their_own_are_kept(tuned):
+    """Numbers as the model has it, but for a mean spread of 3 that only speed_noise explains."""
+
+    class Right(Halves):
+        def terms(self, values):
+            right = norm.logpdf(np.sign(self.z), scale=values.get('speed_std', 1.0))
+            return right + norm.logpdf(self.z, scale=values.get('speed_noise', 1.0))
+
+    made = tuned(Right(), ('speed_std', 'speed_noise'))
+    assert list(made.values) == ['speed_noise']
+    first, second = made.parameters
     assert not first.determined and first.held_out_gain is not None and second.determined
-    assert first.held_out_gain < 2.0 / 40.0 < tuned.held_out_gain
+    assert first.held_out_gain < 2.0 / 40.0 < made.held_out_gain
 
 
 @pytest.mark.parametrize('count, determined', [(3, False), (6, True)])
-def test_too_few_numbers_determine_nothing(count, determined, monkeypatch):
+def test_too_few_numbers_determine_nothing(count, determined, tuned):
     """The logarithm of a spread is known to .41, or to .29."""
-    monkeypatch.setattr(Halves, 'z', 3.0 * np.resize([1.0, -1.0], count))
-    monkeypatch.setattr(tuning, '_recording', lambda job: Halves())
-    job = SimpleNamespace(system='diver')
-    tunables = (Tunable(name='speed_std', start=1.0, std=3.0),)
-    fitting = tuning.Fitting(jobs=(job,), tunables=tunables, split=(count // 2 - 1,))
-    (row,) = tuning.tune(fitting, 40).parameters
+    numbers = Halves()
+    numbers.z = 3.0 * np.resize([1.0, -1.0], count)
+    (row,) = tuned(numbers).parameters
     assert row.determined == determined
+
+
+SEA = ObstacleConfig(max_range=50.0, horizontal_fov_deg=90.0, clutter_density=0.02)
+CLUTTER = 0.02 * 50.0 * 0.5 * math.pi
+"""False echoes of a ping."""
+
+
+def ping(tracker, stamp_ns, distance, bearing):
+    place, level = np.array([0.0, 0.0, -5.0]), np.array([0.0, 0.0, 0.0, 1.0])
+    tracker.process(Navigation(stamp_ns=stamp_ns, position=place, orientation=level))
+    seen = {'range': np.array(distance), 'bearing': np.array(bearing)}
+    tracker.process(Detections(stamp_ns=stamp_ns, **seen))
 
 
 def test_the_score_of_a_sea_without_obstacles_is_that_of_its_clutter():
     """Clutter is a Poisson process: m detections in an area A have m log(density) - density A."""
-    config = ObstacleConfig(max_range=50.0, horizontal_fov_deg=90.0, clutter_density=0.02)
-    tracker = obstacles.Scored(config)
-    place, level = np.array([0.0, 0.0, -5.0]), np.array([0.0, 0.0, 0.0, 1.0])
-    tracker.process(Navigation(stamp_ns=1, position=place, orientation=level))
-    distance, bearing = np.array([10.0, 20.0, 30.0]), np.array([0.0, 0.2, -0.3])
-    tracker.process(Detections(stamp_ns=1, range=distance, bearing=bearing))
-    area = 50.0 * 0.5 * math.pi
-    assert tracker.scores == {1: (pytest.approx(3.0 * math.log(0.02) - 0.02 * area), 0)}
+    tracker = obstacles.Scored(SEA)
+    ping(tracker, 1, [10.0, 20.0, 30.0], [0.0, 0.2, -0.3])
+    assert tracker.scores == {1: (pytest.approx(3.0 * math.log(0.02) - CLUTTER), 0)}
 
 
 def test_an_obstacle_that_is_seen_is_better_predicted_than_one_that_is_missed():
     """A ping in which one of two is missed has the echo of the other, and 1 - p."""
-    config = ObstacleConfig(max_range=50.0, horizontal_fov_deg=90.0, clutter_density=0.02)
-    tracker, level = obstacles.Scored(config), np.array([0.0, 0.0, 0.0, 1.0])
+    tracker = obstacles.Scored(SEA)
     for second in range(1, 13):
-        stamp_ns, echo = second * 10**9, np.array([20.0, 30.0][: 2 if second < 12 else 1])
-        place = np.array([0.0, 0.0, -5.0])
-        tracker.process(Navigation(stamp_ns=stamp_ns, position=place, orientation=level))
-        bearing = np.array([0.2, -0.3])[: len(echo)]
-        tracker.process(Detections(stamp_ns=stamp_ns, range=echo, bearing=bearing))
+        n = 2 if second < 12 else 1
+        ping(tracker, second * 10**9, [20.0, 30.0][:n], [0.2, -0.3][:n])
     scores = [score for score, _ in tracker.scores.values()]
-    both, one, false = scores[-2], scores[-1], 0.02 * 50.0 * 0.5 * math.pi
+    both, one = scores[-2:]
     assert both > scores[0] + 10.0  # where both could only be false
-    missed = math.log(1.0 - config.detection_probability)
+    missed = math.log(1.0 - SEA.detection_probability)
     # Densities of false echoes change a little with each ping.
-    assert one == pytest.approx(0.5 * (both + false) + missed - false, abs=0.5)
-
-
-def kalman(z, R, noise):
-    """Log likelihood of fixes (n, 2) once a second, of one constant velocity."""
-    F = np.array([[1.0, 1.0], [0.0, 1.0]])
-    Q = noise**2 * np.array([[1.0 / 3.0, 0.5], [0.5, 1.0]])
-    total = 0.0
-    for axis in z.T:
-        x, P = np.array([axis[0], 0.0]), np.diag([R, 0.49])
-        for value in axis[1:]:
-            x, P = F @ x, F @ P @ F.T + Q
-            S, innovation = P[0, 0] + R, value - x[0]
-            total -= 0.5 * (innovation**2 / S + math.log(2.0 * math.pi * S))
-            K = P[:, 0] / S
-            x, P = x + K * innovation, P - np.outer(K, P[0])
-    return total
+    assert one == pytest.approx(0.5 * (both + CLUTTER) + missed - CLUTTER, abs=0.5)
 
 
 def score_of(z, R, seconds, scale, noise):
@@ -317,26 +290,23 @@ def score_of(z, R, seconds, scale, noise):
     )  # fmt: skip
     tracker = Scored(config)
     for second, place, covariance in zip(seconds, z, R):
-        position = np.array([*place, 0.0])
-        fix = Fix(stamp_ns=round(second * 1e9), position=position, covariance=covariance)
-        tracker.process(fix)
+        known = {'position': np.array([*place, 0.0]), 'covariance': covariance}
+        tracker.process(Fix(stamp_ns=round(second * 1e9), **known))
     return math.fsum(value for value, _ in tracker.scores.values())
 
 
-class TwoTracks(dict[str, np.ndarray]):
-    """Two tracks of one diver."""
-
-    life = SimpleNamespace(track_id=np.array([1, 2]))
-
-
 def score_of_two(f, is_complete):
-    """The score of fixes with densities f (2, D) under two tracks that exist with .9 and .4; the
-    tracker; and the density of other fixes."""
+    """The score of fixes with densities f (2, D) under two tracks of one diver that exist with .9
+    and .4; the tracker; and the density of other fixes."""
+
+    class Known(dict[str, np.ndarray]):
+        life = SimpleNamespace(track_id=np.array([1, 2]))
+
     config = DiverConfig(clutter_density=2e-4)
     tracker, D = Scored(config), f.shape[1]
     tracker.area, tracker.existence = 500.0, {1: 0.9, 2: 0.4}
     pairs = SimpleNamespace(track_log=np.log(f), direct=np.ones((2, D)), nis=np.zeros((2, D)))
-    known = TwoTracks(existence=np.array([0.9, 0.4]), target_id=np.full(2, NOBODY))
+    known = Known(existence=np.array([0.9, 0.4]), target_id=np.full(2, NOBODY))
     group = SimpleNamespace(
         config=config, association=SimpleNamespace(hit=np.ones(2, bool), fix=np.zeros(2, int)),
         pairs=pairs, new_targets=1e-5, detection=None, target_id=None, is_complete=is_complete,
@@ -361,47 +331,26 @@ def test_the_score_of_a_scan_is_that_of_all_joint_events():
         DiverConfig().detection_probability,
     )
     score, tracker, other = score_of_two(f, is_complete=True)
-    events, exists = [], [[], []]
-    for one in (None, 0, 1):
-        for two in (None, 0, 1):
-            if one is None or one != two:
-                parts = [
-                    1.0 - r[t] * p if d is None else r[t] * p * f[t, d] / other
-                    for t, d in enumerate((one, two))
-                ]
-                events.append(math.prod(parts))
-                for t, d in enumerate((one, two)):
-                    alive = r[t] * (1.0 - p) / (1.0 - r[t] * p) if d is None else 1.0
-                    exists[t].append(events[-1] * alive)
-    total = sum(events)
+    total, exists = 0.0, [0.0, 0.0]
+    for event in product((None, 0, 1), repeat=2):
+        if event[0] is None or event[0] != event[1]:
+            share = math.prod(
+                1.0 - r[t] * p if d is None else r[t] * p * f[t, d] / other
+                for t, d in enumerate(event)
+            )
+            total += share
+            for t, d in enumerate(event):
+                exists[t] += share * (r[t] * (1.0 - p) / (1.0 - r[t] * p) if d is None else 1.0)
     assert score == pytest.approx(2 * math.log(other) - 500.0 * other + math.log(total))
-    assert tracker.existence == pytest.approx(
-        {1: sum(exists[0]) / total, 2: sum(exists[1]) / total}
-    )
+    assert tracker.existence == pytest.approx({1: exists[0] / total, 2: exists[1] / total})
 
 
 def test_the_score_is_that_of_the_reference_vectors():
     """Where the gate refuses no fix: at six and ten times the stated covariances."""
     with np.load(VECTORS / 'tuned.npz') as given:
         scales, noises = given['grid_covariance_scale'][2:], given['grid_acceleration_noise']
-        found = [
-            [score_of(given['z'], given['R'], 1.0 + given['t'], s, q) for q in noises]
-            for s in scales
-        ]
+        fixes = given['z'], given['R'], 1.0 + given['t']
         expected = given['grid_log_likelihood'][2:]
-    first = np.array(found) - found[0][0]  # the first fix has a score that nothing changes
-    np.testing.assert_allclose(first, expected - expected[0, 0], atol=1e-6)
-
-
-def test_the_score_of_one_model_is_the_likelihood_of_a_kalman_filter():
-    rng = np.random.default_rng(3)
-    z = np.cumsum(rng.normal(0.3, 0.05, (40, 2)), axis=0) + rng.normal(0.0, 0.5, (40, 2))
-
-    def score(scale, noise):
-        return score_of(
-            z, 0.25 * np.tile(np.eye(2), (40, 1, 1)), 1.0 + np.arange(40), scale, noise
-        )
-
-    for scale, noise in ((2.0, 0.1), (1.0, 0.3)):
-        expected = kalman(z, 0.25 * scale, noise) - kalman(z, 0.25, 0.1)
-        assert score(scale, noise) - score(1.0, 0.1) == pytest.approx(expected, abs=1e-6)
+    found = np.array([[score_of(*fixes, s, q) for q in noises] for s in scales])
+    # The first fix has a score that nothing changes.
+    np.testing.assert_allclose(found - found[0, 0], expected - expected[0, 0], atol=1e-6)

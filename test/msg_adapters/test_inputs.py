@@ -133,17 +133,14 @@ def label(topic, measurement, **settings):
 
 
 def test_tags_are_numbers_or_their_place_in_the_list():
-    assert tag_numbers(['12', '7']) == {'12': 12, '7': 7}
-    assert tag_numbers(['amy', '7']) == {'amy': 1, '7': 2}
-    assert tag_numbers(['amy', 'bob', 'amy']) == {'amy': 1, 'bob': 2}
-    assert tag_numbers([]) == {}
-
-
-def test_a_part_of_the_topic_or_a_frame_is_a_name():
-    tags = {'tags': ['amy', 'bob']}
-    assert label('/divers/bob/fix', fix(), **tags).target_id == 2
-    assert label('/divers/bobby/fix', fix(), **tags).target_id == NOBODY
-    assert label('bob/fix', fix(), **tags).target_id == 2
+    for tags, numbers in (
+        (['12', '7'], {'12': 12, '7': 7}), (['amy', '7'], {'amy': 1, '7': 2}),
+        (['amy', 'bob', 'amy'], {'amy': 1, 'bob': 2}), ([], {}),
+    ):  # fmt: skip
+        assert tag_numbers(tags) == numbers
+    # A part of the topic or a frame is a name.
+    for topic, number in (('/divers/bob/fix', 2), ('/divers/bobby/fix', NOBODY), ('bob/fix', 2)):
+        assert label(topic, fix(), tags=['amy', 'bob']).target_id == number
     named = label('/fix', fix('amy'), tags=['amy'], frame_id='odom')
     assert (named.target_id, named.frame_id) == (1, 'odom')
     other = label('/fix', fix('map'), tags=['amy'])

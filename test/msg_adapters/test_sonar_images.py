@@ -228,21 +228,18 @@ def oculus(gains=None, size=1, packet=b'', **changes):
     return marine.driver_message('oculus_interfaces/msg/Ping', **values)
 
 
-@pytest.mark.parametrize('size', [1, 2, 4])
-def test_an_oculus_ping_is_read_row_by_row(size):
-    image = read_sent(oculus(size=size))
-    np.testing.assert_array_equal(image.amplitude, PIXELS)
-    assert image.range == pytest.approx(0.5 * np.arange(8) + 0.25)
-    # Hundredths of a degree, positive to starboard.
-    assert np.degrees(image.bearing) == pytest.approx([30.0, 15.0, 5.0, -5.0, -15.0, -30.0])
-    assert image.stamp_ns == 100_000_000_005 and image.frame_id == 'sonar'
-
-
-def test_gains_of_an_oculus_are_divided_out_and_a_packet_is_read_from_its_end():
+def test_an_oculus_ping_is_read_row_by_row():
+    for size in (1, 2, 4):
+        image = read_sent(oculus(size=size))
+        np.testing.assert_array_equal(image.amplitude, PIXELS)
+        assert image.range == pytest.approx(0.5 * np.arange(8) + 0.25)
+        # Hundredths of a degree, positive to starboard.
+        assert np.degrees(image.bearing) == pytest.approx([30.0, 15.0, 5.0, -5.0, -15.0, -30.0])
+        assert image.stamp_ns == 100_000_000_005 and image.frame_id == 'sonar'
+    # Gains are divided out, and a packet is read from its end.
     gains = np.array([1, 4, 9, 16, 25, 36, 49, 0])
-    image = read_sent(oculus(gains=gains))
     wanted = PIXELS / np.sqrt(np.maximum(gains, 1))[:, None]
-    np.testing.assert_allclose(image.amplitude, wanted)
+    np.testing.assert_allclose(read_sent(oculus(gains=gains)).amplitude, wanted)
     header = b'\x53\x4f' + bytes(range(200))
     np.testing.assert_array_equal(read_sent(oculus(packet=header)).amplitude, PIXELS)
 
@@ -287,20 +284,18 @@ def photo(pixels=PIXELS, encoding='mono8', dtype='u1', big=False, pad=0, **chang
     return marine.make('sensor_msgs/msg/Image', **values)
 
 
-@pytest.mark.parametrize('message', [sonoptix(), sonoptix(offset=3), photo()])
-def test_ranges_and_directions_come_from_parameters(message):
-    image = read_sent(message, **GEOMETRY)
-    np.testing.assert_array_equal(image.amplitude, PIXELS)
-    assert image.range == pytest.approx(3.25 + 2.5 * np.arange(8))
-    assert np.degrees(image.bearing) == pytest.approx([25.0, 15.0, 5.0, -5.0, -15.0, -25.0])
-    turned = read_sent(message, **GEOMETRY, image_first_beam='starboard', image_first_range='far')
-    np.testing.assert_array_equal(turned.amplitude, PIXELS[::-1, ::-1])
-    assert turned.bearing[0] > 0.0 and turned.range[0] < turned.range[-1]
-    assert refused(message) == 'no_geometry'
-    assert refused(message, image_far_range=20.0) == 'no_geometry'
-
-
-def test_an_image_of_beam_rows_is_turned_and_one_without_pixels_read():
+def test_ranges_and_directions_come_from_parameters():
+    for message in (sonoptix(), sonoptix(offset=3), photo()):
+        image = read_sent(message, **GEOMETRY)
+        np.testing.assert_array_equal(image.amplitude, PIXELS)
+        assert image.range == pytest.approx(3.25 + 2.5 * np.arange(8))
+        assert np.degrees(image.bearing) == pytest.approx([25.0, 15.0, 5.0, -5.0, -15.0, -25.0])
+        first = {'image_first_beam': 'starboard', 'image_first_range': 'far'}
+        turned = read_sent(message, **GEOMETRY, **first)
+        np.testing.assert_array_equal(turned.amplitude, PIXELS[::-1, ::-1])
+        assert turned.bearing[0] > 0.0 and turned.range[0] < turned.range[-1]
+        assert refused(message) == refused(message, image_far_range=20.0) == 'no_geometry'
+    # An image of beam rows is turned, and one without pixels read.
     image = read_sent(photo(PIXELS.T), **GEOMETRY, image_order='beam_major')
     np.testing.assert_array_equal(image.amplitude, PIXELS)
     message = photo(pixels=np.zeros((0, 0), int))
@@ -363,16 +358,16 @@ def test_a_message_that_cannot_be_is_refused(make, code):
         assert refused(make(**changes), **GEOMETRY) == code, changes
 
 
-@pytest.mark.parametrize('factor, encoding', [(1.0, 'mono8'), (0.5, '32FC1'), (300.0, '32FC1')])
-def test_a_written_picture_is_read_again(factor, encoding):
+def test_a_written_picture_is_read_again():
     place = {'range': 3.25 + 2.5 * np.arange(8), 'bearing': np.radians(25.0 - 10.0 * np.arange(6))}
-    image = SonarImage(stamp_ns=7, frame_id='sonar', amplitude=factor * PIXELS, **place)
-    message = write_picture(image, ros_message)
-    assert message.encoding == encoding
-    again = read_sent(message, **GEOMETRY)
-    np.testing.assert_allclose(again.amplitude, image.amplitude)
-    np.testing.assert_allclose(again.range, image.range)
-    assert (again.stamp_ns, again.frame_id) == (7, 'sonar')
+    for factor, encoding in ((1.0, 'mono8'), (0.5, '32FC1'), (300.0, '32FC1')):
+        image = SonarImage(stamp_ns=7, frame_id='sonar', amplitude=factor * PIXELS, **place)
+        message = write_picture(image, ros_message)
+        assert message.encoding == encoding
+        again = read_sent(message, **GEOMETRY)
+        np.testing.assert_allclose(again.amplitude, image.amplitude)
+        np.testing.assert_allclose(again.range, image.range)
+        assert (again.stamp_ns, again.frame_id) == (7, 'sonar')
 
 
 # -- fans as a screen shows them

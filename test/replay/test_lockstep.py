@@ -6,7 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Lock-step with real nodes: every answer waited for, and what is wrong said."""
+"""Lock-step with real nodes: every answer waited for, and what is wrong said; how long a link
+waits, told by a clock that the test moves, and which tables are listened to."""
 
 from contextlib import ExitStack
 import threading
@@ -18,14 +19,17 @@ import numpy as np
 import pytest
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64
 
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.qos import lockstep_qos
 from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.replay import link as module
 from sonar_imm_tools.replay import lockstep as lockstep_module
 from sonar_imm_tools.replay.harness import START_LIMIT
 from sonar_imm_tools.replay.link import Link, LinkError
+from sonar_imm_tools.replay.listening import TableListener
 from sonar_imm_tools.replay.lockstep import Chain, Counts, LockStep, Recorder
 from sonar_imm_tools.replay.player import play, Player, PlayOptions
 
@@ -62,15 +66,14 @@ RELIABLE = ('-p', f'{QOS}.reliability:=reliable', '-p', f'{QOS}.history:=keep_al
 @pytest.fixture
 def start(walker, domain):
     """Start live walkers, all ended with the test."""
-    started = []
+    with ExitStack() as started:
 
-    def start(*parameters):
-        started.append(Live(domain, *parameters))
-        return started[-1]
+        def start(*parameters):
+            live = Live(domain, *parameters)
+            started.callback(live.end)
+            return live
 
-    yield start
-    for live in started:
-        live.end()
+        yield start
 
 
 @pytest.fixture
@@ -78,36 +81,31 @@ def stepping(bag, link, monkeypatch):
     """Make a player in lock-step with the walker, and the recorder of its estimates. The walker
     never hears the other topic of the bag, and nobody waits for that."""
     monkeypatch.setattr(lockstep_module, '_OTHER_INPUTS', 0.0)
-    with ExitStack() as stack:
+    with BagReader(bag) as reader:
 
         def stepping(**options):
-            reader = stack.enter_context(BagReader(bag))
             recorder = Recorder(link, '/walker')
             step = LockStep(link, '/walker', recorder=recorder)
             chosen = PlayOptions(lockstep='/walker', **options)
-            return Player(reader, link, chosen, step), recorder, step
+            return Player(reader, link, chosen, step), step, recorder
 
         yield stepping
 
 
-def test_lockstep_gets_the_estimate_of_every_message(link, start, stepping):
+def test_lockstep_gets_the_estimate_of_every_message(start, stepping):
     start(*RELIABLE)
-    player, recorder, step = stepping()
+    player, step, recorder = stepping()
     player.run(start_limit=START_LIMIT)
     assert player.result().published == COUNT + 1  # the other topic goes along, unanswered
     assert step.counts == (COUNT, 1, COUNT - 1)
     assert len(player.result().delays) == COUNT - 1
     used = [float(k) for k in range(COUNT) if k != 3]
-    assert [e.state[0, 0] for e in recorder.estimates()] == [
-        pytest.approx(np.mean(used[: k + 1])) for k in range(COUNT - 1)
-    ]
-
-
-def test_a_second_player_counts_from_where_the_node_stands(link, start, stepping):
-    start(*RELIABLE)
-    first, _, _ = stepping()
-    first.run(start_limit=START_LIMIT)
-    second, recorder, step = stepping(start_offset=0.1)
+    means = [np.mean(used[: k + 1]) for k in range(COUNT - 1)]
+    made = recorder.estimates()
+    assert [each.state[0, 0] for each in made] == pytest.approx(means)
+    assert (made[0].frame_id, made[0].model_names) == ('map', ('slow', 'fast'))
+    # A second player counts from where the node stands.
+    second, step, recorder = stepping(start_offset=0.1)
     second.run(start_limit=START_LIMIT)
     assert step.counts == (COUNT - 10, 0, 0)  # all duplicates: answered without an estimate
     assert len(recorder) == 0
@@ -116,55 +114,54 @@ def test_a_second_player_counts_from_where_the_node_stands(link, start, stepping
 def test_lockstep_finds_the_only_node_and_asks_where_there_are_two(
     bag, start, domain, monkeypatch
 ):
+    options = PlayOptions(lockstep='auto')
     monkeypatch.setattr(lockstep_module, '_OTHER_INPUTS', 0.0)
     start(*RELIABLE)
-    result = play(bag, PlayOptions(lockstep='auto'), domain_id=domain)
-    assert len(result.delays) == COUNT - 1
+    assert len(play(bag, options, domain_id=domain).delays) == COUNT - 1
     start('-r', '__node:=other')
     monkeypatch.setattr(lockstep_module, '_SECOND_LOOK', 15.0)
     with pytest.raises(LinkError, match='several nodes run: say which of /other, /walker'):
-        play(bag, PlayOptions(lockstep='auto'), domain_id=domain)
+        play(bag, options, domain_id=domain)
 
 
 def test_a_row_that_was_lost_is_asked_for_again(link, start, stepping, monkeypatch):
     monkeypatch.setattr(lockstep_module, '_ASKED_AGAIN', 0.1)
     start(*RELIABLE)
-    player, recorder, step = stepping()
+    player, step, recorder = stepping()
     lost = step._answers
     link.node.destroy_subscription(lost)  # as if its row never came
     player.run(start_limit=START_LIMIT)
     assert step._answers is not lost and len(recorder) == COUNT - 1
 
 
-def test_lockstep_without_a_node_says_so(link, stepping):
-    player, _, _ = stepping()
-    with pytest.raises(LinkError, match="no answer from a node '/walker'"):
-        player.run(start_limit=0.3)
+POINTS = "input_types:=['fix=geometry_msgs/msg/PointStamped']"
 
 
-def test_lockstep_names_the_type_the_node_expects(link, start, monkeypatch, stepping):
-    monkeypatch.setattr(lockstep_module, 'MATCH_LIMIT', 0.3)
-    start('-p', "input_types:=['fix=geometry_msgs/msg/PointStamped']")
-    assert link.wait_for(lambda: link.node.get_subscriptions_info_by_topic('/fix'), 120.0)
-    player, _, _ = stepping(topics=('/fix',))
-    with pytest.raises(LinkError, match='expects geometry_msgs/msg/PointStamped on /fix'):
-        player.run(start_limit=START_LIMIT)
+@pytest.mark.parametrize(
+    'node, topic, seconds, said',
+    [
+        (None, '/fix', 0.3, "no answer from a node '/walker'"),
+        (('-p', POINTS), '/fix', START_LIMIT, 'expects geometry_msgs/msg/PointStamped on /fix'),
+        ((), '/other', START_LIMIT, r'listens to none of the topics of the bag \(/other\)'),
+    ],
+)
+def test_lockstep_says_which_node_and_input_are_not_there(
+    link, start, monkeypatch, stepping, node, topic, seconds, said
+):
+    monkeypatch.setattr(lockstep_module, 'MATCH_LIMIT', 0.4)
+    if node is not None:
+        start(*node)
+        assert link.wait_for(lambda: link.node.get_subscriptions_info_by_topic('/fix'), 120.0)
+    player, *_ = stepping(topics=(topic,))
+    with pytest.raises(LinkError, match=said):
+        player.run(start_limit=seconds)
 
 
-def test_lockstep_says_when_no_topic_fits(link, start, monkeypatch, stepping):
-    monkeypatch.setattr(lockstep_module, 'MATCH_LIMIT', 0.5)
-    start()
-    player, _, _ = stepping(topics=('/other',))
-    with pytest.raises(LinkError, match=r'listens to none of the topics of the bag \(/other\)'):
-        player.run(start_limit=START_LIMIT)
-
-
-def test_lockstep_notices_a_node_that_does_not_answer(link, start, monkeypatch, stepping):
+def test_lockstep_notices_a_node_that_does_not_answer(start, monkeypatch, stepping):
     monkeypatch.setattr(lockstep_module, 'ANSWER_LIMIT', 0.3)
-    live = start(*RELIABLE)
-    release = threading.Event()
+    live, release = start(*RELIABLE), threading.Event()
     monkeypatch.setattr(live.node.tracker, 'process', lambda m: release.wait(20.0) and [])
-    player, _, _ = stepping()
+    player, *_ = stepping()
     try:
         with pytest.raises(LinkError, match='did not answer message 1 on /fix within 0.3 s'):
             player.run(start_limit=START_LIMIT)
@@ -175,7 +172,7 @@ def test_lockstep_notices_a_node_that_does_not_answer(link, start, monkeypatch, 
 def test_lockstep_notices_somebody_else_who_publishes(link, start, stepping):
     start(*RELIABLE)
     other = link.node.create_publisher(PoseWithCovarianceStamped, '/fix', lockstep_qos())
-    player, _, _ = stepping()
+    player, *_ = stepping()
     link.wait_for(other.get_subscription_count, 120.0)
 
     def meddle(count):
@@ -190,7 +187,7 @@ def test_lockstep_waits_for_an_input_that_is_found_late(link, start, stepping, m
     """Discovery tells the inputs of a node one by one; what goes to one that it has not told yet
     would be taken for somebody else's."""
     start(*RELIABLE)
-    player, _, step = stepping()
+    player, step, _ = stepping()
     monkeypatch.setattr(lockstep_module, '_OTHER_INPUTS', 60.0)
     Ear(link, Float64, '/other')
     looks = []
@@ -205,9 +202,8 @@ def test_lockstep_waits_for_an_input_that_is_found_late(link, start, stepping, m
 
 def test_a_step_waits_until_the_estimates_of_the_message_are_here(link):
     """The answer and the estimates come on two topics: which is first, nobody says."""
-    recorder = []
+    recorder, lengths = [], []
     step = LockStep(link, '/walker', recorder=recorder)
-    lengths = []
 
     def spin(seconds):
         lengths.append(len(recorder))
@@ -222,16 +218,74 @@ def test_a_step_waits_until_the_estimates_of_the_message_are_here(link):
     assert lengths == [0, 0, 1] and len(step.delays) == 1
 
 
-def test_recorded_estimates_read_back(link, start, stepping):
-    start(*RELIABLE)
-    player, recorder, _ = stepping(topics=('/fix',))
-    player.run(start_limit=START_LIMIT)
-    estimate = recorder.estimates()[0]
-    assert estimate.frame_id == 'map'
-    assert estimate.model_names == ('slow', 'fast')
-
-
 def test_of_two_nodes_each_message_counts_once():
     """Seven of the second one's nine messages came from the first; the player sent twelve."""
     first, second = (SimpleNamespace(counts=Counts(*each)) for each in ((10, 1, 7), (9, 2, 6)))
     assert Chain(first, second, ()).counts == (12, 3, 6)
+
+
+@pytest.fixture
+def deaf(monkeypatch):
+    """A link that hears nothing; each look at its callbacks takes as long as it may."""
+    link, clock = object.__new__(Link), SimpleNamespace(now=1000.0, spun=[])
+
+    def spin(seconds):
+        clock.spun.append(seconds)
+        clock.now += seconds
+
+    monkeypatch.setattr(module, 'time', SimpleNamespace(monotonic=lambda: clock.now))
+    link.spin, link.clock = spin, clock
+    return link
+
+
+def test_what_does_not_come_is_waited_for_as_long_as_is_said_and_what_comes_ends_it(deaf):
+    assert deaf.wait_for(lambda: False, 2.25) is False
+    assert deaf.clock.now == pytest.approx(1002.25)
+    assert max(deaf.clock.spun) <= 0.1 and min(deaf.clock.spun) > 0.0
+    assert deaf.wait_for(lambda: deaf.clock.now > 1003.0, 60.0) is True
+    assert deaf.clock.now == pytest.approx(1003.1, abs=0.11)
+
+
+def test_trouble_is_asked_for_ten_times_a_second_and_ends_the_waiting(deaf):
+    asked = []
+
+    def trouble():
+        asked.append(deaf.clock.now)
+        return 'the node ended' if len(asked) == 3 else None
+
+    # Callbacks that come in quick succession.
+    deaf.spin = lambda seconds: setattr(deaf.clock, 'now', deaf.clock.now + 0.01)
+    with pytest.raises(LinkError, match='the node ended'):
+        deaf.wait_for(lambda: False, 60.0, trouble)
+    assert asked == pytest.approx([1000.1, 1000.2, 1000.3], abs=0.035)
+
+
+def test_without_names_every_estimate_is_heard_but_the_truth(link):
+    kinds = {'/auv/diver/estimate': PointCloud2, '/truth/estimate': PointCloud2}
+    kinds |= {'/other/estimate': Float64, '/estimate/raw': PointCloud2}
+    out = {name: link.node.create_publisher(kind, name, 10) for name, kind in kinds.items()}
+    listener = TableListener(link)
+    for table in listener.tables(120.0):
+        if table is not None:
+            break
+        for publisher, kind in zip(out.values(), kinds.values()):
+            publisher.publish(kind())
+    assert listener.topics == ['/auv/diver/estimate'] and table.topic == '/auv/diver/estimate'
+
+
+@pytest.mark.parametrize(
+    'wanted, said',
+    [
+        ((), 'no topic that ends in /estimate was found within 0.1 s'),
+        (('diver/estimat',), r"nobody publishes /diver/estimat within .* mean '/diver/estimate'"),
+        (('diver/estimate',), 'nothing was published on /diver/estimate within 0.1 s'),
+        (('fix',), 'std_msgs/msg/Float64 and no table; ros2 topic echo /fix'),
+    ],
+)
+def test_silence_says_what_was_looked_for(link, wanted, said):
+    kinds = {'/diver/estimate': PointCloud2, '/fix': Float64} if wanted else {}
+    for name, kind in kinds.items():
+        link.node.create_publisher(kind, name, 10)
+    assert link.wait_for(lambda: all(map(link.node.count_publishers, kinds)), 60.0)
+    with pytest.raises(LinkError, match=said):
+        list(TableListener(link, wanted).tables(0.1))

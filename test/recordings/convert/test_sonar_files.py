@@ -23,7 +23,7 @@ from msg_adapters.soundings import read_ground
 from sonar_imm.measurements import Detections, Navigation, Snapshot
 from sonar_imm_tools.recordings.conversion import ConversionReport
 from sonar_imm_tools.recordings.convert import convert_pictures, convert_xtf, sniff
-from sonar_imm_tools.recordings.convert.xtf import pings_of
+from sonar_imm_tools.recordings.convert.xtf import _sides, pings_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
 
@@ -345,6 +345,11 @@ class TestXtf:
         os.mkfifo(tmp_path / 'b.xtf')
         with pytest.raises(BagError, match='this is no file'):
             convert_xtf(tmp_path / 'b.xtf', tmp_path / 'none')
+
+
+def test_a_channel_of_no_side_is_passed_over():
+    rows = [{'side': side, 'samples': np.arange(3)} for side in ('port', 'starboard', '')]
+    assert set(_sides({'channels': rows}, 'near')) == {'port', 'starboard'}
 
 
 @pytest.fixture
