@@ -16,7 +16,7 @@ import re
 import webbrowser
 from xml.etree import ElementTree
 
-from helpers.report_pages import figures
+from helpers.commands import figures
 import numpy as np
 import plotly.graph_objects as go
 from plotly.utils import PlotlyJSONEncoder

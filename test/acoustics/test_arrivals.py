@@ -9,7 +9,7 @@
 """Paths and angles of arrivals, and the least-squares problem of one ping: vectors, derivatives,
 closed form, search."""
 
-from helpers.sea_vectors import vectors
+from helpers.vector_files import vectors
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 import numpy as np

@@ -21,7 +21,7 @@ import re
 import sys
 from typing import NamedTuple
 
-from helpers.field_files import measured, text_of
+from helpers.field_files import MAKERS, measured, text_of
 from helpers.sonar_files import write_segy
 import numpy as np
 import pytest
@@ -69,8 +69,7 @@ BEGIN = 1_756_382_400
 """2025-08-28 12:00:00 UTC."""
 PLACE = Origin(43.31, 5.36, 0.0)
 RECEIVERS = {
-    'VR2AR-551': (0, 0), 'VR2AR-552': (300, 10), 'VR2AR-553': (290, 250),
-    'VR2AR-554': (-10, 260),
+    'VR2-551': (0, 0), 'VR2-552': (300, 10), 'VR2-553': (290, 250), 'VR2-554': (-10, 260)
 }  # fmt: skip
 EAST = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -99,10 +98,10 @@ def heard(period=(20, 40), seconds=600, seed=1):
 
 
 def detections(folder, head, line, **how):
-    """detections.csv of `line(k, t, receiver)`, and receivers.csv."""
+    """detections.csv of `line(t, receiver)`, and receivers.csv."""
     places = [f'{name},{x},{y},-3' for name, (x, y) in RECEIVERS.items()]
     (folder / 'receivers.csv').write_text('\n'.join(['receiver,x,y,z', *places]) + '\n')
-    lines = [line(k, t, name) for k, (t, name) in enumerate(heard(**how))]
+    lines = [line(t, name) for t, name in heard(**how)]
     (folder / 'detections.csv').write_text('\n'.join([head, *lines]) + '\n')
 
 
@@ -302,23 +301,7 @@ def export(head, line, **how):
     return lambda folder: detections(folder, head, line, **how)
 
 
-VUE = 'Date and Time (UTC),Receiver,Transmitter'
-TEXT, RMSE_FISH = text_of, lambda run: run.rmse(circle) < 0.5
-MAKERS = {
-    'otn': ('collectionCode,catalogNumber,station,receiver,tagName,codeSpace,dateCollectedUTC',
-            lambda k, t, r: f'A,A-{k},S{r[-1]},{r},A69-1-7,A69-1,{TEXT(t, 6)}'),
-    'glatos': ('animal_id,detection_timestamp_utc,transmitter_codespace,transmitter_id,'
-               'receiver_sn',
-               lambda k, t, r: f'15,{TEXT(t, 6)},A69-1,7,{r}'),
-    'lotek': ('Date,Time,TOA,Tag ID,Receiver,Power',
-              lambda k, t, r: f'{TEXT(t, 0, "%m/%d/%y,%H:%M:%S")},{t % 1:.5f},7,{r},99'),
-    'thelma': ('Date and Time (UTC),ID,Data,Protocol,SNR,Receiver,Millisecond',
-               lambda k, t, r: f'{TEXT(t, 0)},7,0,S256,20,{r},{int(t % 1 * 1000)}'),
-    'fathom': ('VEMCO DATA LOG,2.0.0,vdat\nRECORD TYPE,FIELD\nDIAG_DESC,Device Time (UTC),Noise\n'
-               'DET_DESC,Device Time (UTC),Time,Model,Serial Number,Channel,Full ID,ID',
-               lambda k, t, r: (f'DIAG,{TEXT(t, 0)},9\n' if k % 9 == 0 else '')
-               + f'DET,{TEXT(t, 6)},{TEXT(t, 6)},{r.replace("-", ",")},69,A69-1-7,7'),
-}  # fmt: skip
+VUE, TEXT = 'Date and Time (UTC),Receiver,Transmitter', text_of
 
 
 def swapped(folder):
@@ -454,11 +437,12 @@ def times_too_small(run):
 
 
 CASES = [
-    Case('coarse_stamps', export(VUE, lambda k, t, r: f'{TEXT(t, 0)},{r},7'), (TELEMETRY,),
+    Case('coarse_stamps', export(VUE, lambda t, r: f'{TEXT(t, 0)},{r},7'), (TELEMETRY,),
          lambda run: run.codes == [2] and 'resolution of 1 s' in run.words),
-    *(Case(f'other_makers {name}', export(*maker), (TELEMETRY, FISH), RMSE_FISH if name != 'thelma'
-           else lambda run: run.rmse(circle) < 1.0) for name, maker in MAKERS.items()),
-    Case('burst_of_a_second tracked', export(VUE, lambda k, t, r: f'{TEXT(t, 6)},{r},7',
+    *(Case(f'other_makers {name}', export(*MAKERS[name]), (TELEMETRY, FISH),
+           lambda run: run.rmse(circle) < 0.5)
+      for name in ('otn', 'glatos', 'lotek', 'thelma', 'fathom')),
+    Case('burst_of_a_second tracked', export(VUE, lambda t, r: f'{TEXT(t, 6)},{r},7',
          period=(1, 1), seconds=100), (TELEMETRY, FISH),
          lambda run: len(run.t) > 85 and run.rmse(circle) < 0.5),
     Case('gpx_odd_waypoint', odd_waypoint, ('convert track.gpx b',

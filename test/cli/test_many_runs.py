@@ -15,7 +15,7 @@ from pathlib import Path
 
 from helpers.clusters import small_cluster
 from helpers.commands import contents
-from helpers.dive_bags import write_dive
+from helpers.dive_scenes import write_dive
 from helpers.source import ROOT
 import pytest
 

@@ -16,7 +16,7 @@ import shutil
 import subprocess
 import sys
 
-from helpers.dive_bags import write_dive
+from helpers.dive_scenes import write_dive
 from helpers.source import ROOT
 import pytest
 import yaml

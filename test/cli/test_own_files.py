@@ -15,7 +15,7 @@ import sys
 import webbrowser
 
 from helpers.commands import contents, run
-from helpers.dive_bags import write_dive
+from helpers.dive_scenes import write_dive
 import pytest
 
 from sonar_imm_tools.offline.run_folder import RunFolder

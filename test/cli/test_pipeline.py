@@ -18,7 +18,7 @@ import shutil
 from attrs import evolve
 from helpers import marine
 from helpers.commands import contents
-from helpers.dive_bags import write_dive
+from helpers.dive_scenes import write_dive
 from helpers.field_files import bag_of, FORMATS, line, measured
 from helpers.source import ROOT
 import numpy as np
@@ -130,8 +130,6 @@ def test_bad_parameter_files_and_topics_are_one_sentence_of_the_system_that_is_m
         (b'model_set: vc', 'must be one of'),
         (b'\xff\xfe', 'is not a text file'),
         (b'input_types: [fix=geometry_msgs/msg/PointStampd]', 'geometry_msgs/msg/PointStamped'),
-        ('fix=/nope', "has no topic '/nope'"),
-        ('nonsense=/fix', "the diver tracker has no input 'nonsense'"),
         ('detections=/nope', "has no topic '/nope'"),
     ):
         option = ['--params', str(params)] if isinstance(text, bytes) else ['--topic', text]
@@ -139,18 +137,6 @@ def test_bad_parameter_files_and_topics_are_one_sentence_of_the_system_that_is_m
         assert main(['track', str(dive), str(tmp_path / 'out'), *option]) == 2
         errors = capsys.readouterr().err
         assert words in errors and 'bathymetry' not in errors and not (tmp_path / 'out').exists()
-
-
-def test_convert_tells_what_it_left_out(call, tmp_path, capsys):
-    table, again = tmp_path / 'usbl.csv', str(tmp_path / 'again')
-    head, row = 'when,easting,northing,std\n', '170000000{},{},{},0.5\n'.format
-    table.write_text(head + row(0, 1, 2) + row(1, 'x', 2) + row(2, 1, 3))
-    words = ['convert', 'fixes', str(table), '--column', 'stamp=when', '--time-offset', '0.5']
-    result = call(*words, tmp_path / 'bag')
-    assert result['messages'] == {'/fix': 2} and result['bad_rows'] == 1
-    assert main([*words, again]) == 0 and 'line 3' in capsys.readouterr().out
-    assert main([*words, again]) == 2 and 'exists already' in capsys.readouterr().err
-    assert call('info', tmp_path / 'bag')['systems'] == {'diver': {'fix': ['/fix']}}
 
 
 @pytest.mark.parametrize('command', ['simulate', 'track'])
@@ -224,17 +210,9 @@ def test_the_water_bottom_of_a_real_line_is_followed(call, tmp_path, line):
     assert np.mean(hits) >= 0.94 and len(ids) <= 0.012 * len(traces)
 
 
-@pytest.mark.parametrize(
-    'setting, reason',
-    [
-        ('min_separation=20.0', 'too_crowded: 12 members'),
-        ('phones=9', 'wrong_hydrophones: the array has 8 hydrophones, not 9'),
-    ],
-)
-def test_a_run_whose_records_were_all_refused_fails_with_the_reason(
-    tmp_path, capsys, setting, reason
-):
+def test_a_run_whose_records_were_all_refused_fails_with_the_reason(tmp_path, capsys):
     out, bag = tmp_path / 'out', ROOT / 'bags' / 'fathometer_array'
+    setting, reason = 'phones=9', 'wrong_hydrophones: the array has 8 hydrophones, not 9'
     assert main(['track', str(bag), str(out), '--set', setting]) == 2
     assert f'refused: 12 ({reason}' in capsys.readouterr().err
     assert not out.exists()

@@ -12,7 +12,7 @@ import importlib
 import pickle
 
 import attrs
-from helpers.hostile.properties import check_numbers
+from helpers.hostile.runs import check_numbers
 from helpers.scenes import small_scene, smaller_scene
 from helpers.tracked import as_bytes, BAGS, published, resumed, RUNS, tracked
 import numpy as np

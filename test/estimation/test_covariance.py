@@ -12,7 +12,7 @@ positive definite: cases no double can hold, exact fractions, batches."""
 from fractions import Fraction
 from functools import partial
 
-from helpers.sea_vectors import vectors
+from helpers.vector_files import vectors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np

@@ -12,8 +12,8 @@ import itertools
 import math
 from types import SimpleNamespace
 
-from helpers.sea_vectors import vectors as sea_vectors
 from helpers.vector_files import load_vectors
+from helpers.vector_files import vectors as sea_vectors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np

@@ -18,10 +18,9 @@ from types import ModuleType, SimpleNamespace
 from unittest.mock import MagicMock
 
 from attrs import evolve
-from helpers import report_pages
-from helpers.dive_bags import write_dive
-from helpers.dive_scenes import single_run
-from helpers.report_pages import unpacked
+from helpers import commands
+from helpers.commands import unpacked
+from helpers.dive_scenes import single_run, write_dive
 import numpy as np
 import plotly.graph_objects as go
 import pytest
@@ -78,7 +77,7 @@ class Page(HTMLParser):
     def __init__(self, text):
         super().__init__()
         self.headings, self.cells, self.plotlyjs, self.loads = [], [], '', []
-        self.figures, self._open, self._inside_cell = report_pages.figures(text), None, False
+        self.figures, self._open, self._inside_cell = commands.figures(text), None, False
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
@@ -210,7 +209,7 @@ def kinds(sizes):
     drawn = [go.Figure(go.Scattergl(x=list(range(n)), y=list(range(n)))) for n in sizes]
     sections = [report.Section('figure', 'text', figure) for figure in drawn]
     text = report.report_html(report.Part(run=RUN, metrics={}, summary='', sections=sections))
-    return [figure['data'][0]['type'] for figure in report_pages.figures(text)]
+    return [figure['data'][0]['type'] for figure in commands.figures(text)]
 
 
 def test_only_the_largest_figures_use_the_graphics_card_and_small_ones_never():

@@ -6,9 +6,14 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The command in this process, what it leaves, and processes that are begun."""
+"""The command in this process, what it leaves, and processes that are begun; what stands in a
+report, whose figures are packed, and drawn when they come into view."""
 
+import base64
+import gzip
+import json
 from pathlib import Path
+import re
 
 from sonar_imm_tools.cli import main
 
@@ -30,3 +35,13 @@ def contents(folder, *passed_over):
 def children(pid):
     """The processes that a process has begun."""
     return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
+
+
+def unpacked(text):
+    """What was packed into a page, as text."""
+    return gzip.decompress(base64.b64decode(text)).decode()
+
+
+def figures(page):
+    """The plotly figures of a page, in its order."""
+    return [json.loads(unpacked(text)) for text in re.findall(r'data-figure="([^"]+)"', page)]

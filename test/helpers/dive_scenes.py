@@ -10,11 +10,17 @@
 
 import numpy as np
 
+from msg_adapters.fixes import write_fix
 from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import Fix
+from sonar_imm.truth import TrueTrack
+from sonar_imm_tools.recordings.truth import records_of
+from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
 START_NS = 1_700_000_000_000_000_000
 SECOND = 10**9
 HEADINGS = tuple(f'heading_{index * 360 // 16:03d}' for index in range(16)) + ('hover',)
+FIX_SIGMA = 1.2
 SIGMA = np.array([0.6, 0.3, 0.2, 0.1])
 
 
@@ -88,3 +94,30 @@ def single_run(count=400, seed=1, spread=1.0):
     ]
     true = [truth_estimate(stamp, state[None], [0]) for stamp, state in zip(stamps(times), truth)]
     return estimates, true, times
+
+
+def write_dive(path, *, count=120, seed=4, truth=True, topic='/fix', spoilt=(), shuffle=False):
+    """One diver, a fix a second, truth at half seconds; `spoilt` fixes have a NaN position."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(count) * 1.0
+    place = legs(times)[:, :2] + rng.normal(0.0, FIX_SIGMA, (count, 2))
+    order = np.arange(count)
+    if shuffle:
+        for pair in range(10, count - 1, 7):
+            order[[pair, pair + 1]] = order[[pair + 1, pair]]
+    with BagWriter(path) as bag:
+        if truth:
+            dense = np.arange(2 * count) * 0.5
+            state = legs(dense)
+            true = TrueTrack(0, stamps(dense), state[:, :2], state[:, 2:])
+            for stamp, name, message in records_of(true, 'map'):
+                bag.write(name, message, stamp)
+        stamp_ns = stamps(times)
+        for arrival, index in enumerate(order):
+            given = {'position': [*place[index], 0.0], 'covariance': np.eye(2) * FIX_SIGMA**2}
+            fix = Fix(stamp_ns=stamp_ns[index], frame_id='map', **given)
+            message = write_fix(fix, ros_message)
+            if index in spoilt:
+                message.pose.pose.position.x = float('nan')
+            bag.write(topic, message, stamp_ns[arrival])
+    return path

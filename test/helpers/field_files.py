@@ -58,6 +58,31 @@ def text_of(t, digits=3, pattern='%Y-%m-%d %H:%M:%S'):
     return whole + (f'.{int(t % 1 * 10**digits + 1e-6):0{digits}d}' if digits else '')
 
 
+MAKERS = {
+    'otn': ('station,receiver,tagName,codeSpace,dateCollectedUTC',
+            lambda t, r: f'S1,{r},A69-1602-7001,A69-1602,{text_of(t, 6)}'),
+    'glatos': ('animal_id,detection_timestamp_utc,transmitter_codespace,transmitter_id,'
+               'receiver_sn', lambda t, r: f'9,{text_of(t, 6)},A69-1602,7001,{r}'),
+    'etn': ('date_time,tag_serial_number,acoustic_tag_id,receiver_id,station_name',
+            lambda t, r: f'{text_of(t, 6)},1187,A69-1602-7001,{r},bh'),
+    'actel': ('Timestamp,Receiver,CodeSpace,Signal,Valid',
+              lambda t, r: f'{text_of(t, 6)},{r},A69-1602,7001,TRUE'),
+    'lotek': ('Date,Time,TOA,Tag ID,Receiver,Power',
+              lambda t, r: f'{text_of(t, 0, "%m/%d/%y,%H:%M:%S")},{t % 1:.6f},'
+                           f'A69-1602-7001,{r},147'),
+    'thelma': ('Date and Time (UTC),ID,Data,Protocol,SNR,Receiver,Microsecond',
+               lambda t, r: f'{text_of(t, 0)},A69-1602-7001,0,S256,20,{r},{int(t % 1 * 1e6)}'),
+    'fathom': ('VEMCO DATA LOG,2.0.0,vdat\nRECORD TYPE,FIELD\nDIAG_DESC,Device Time (UTC),Model\n'
+               'DET_DESC,Device Time (UTC),Time,Model,Serial Number,Channel,Full ID,ID',
+               lambda t, r: f'DIAG,{text_of(t, 6)},{r[:3]}\n'
+               f'DET,{2 * (text_of(t, 6) + ",")}VR2,{r[4:]},69,A69-1602-7001,7001'),
+    'serial_number': ('Date and Time (UTC),Receiver,Transmitter',
+                      lambda t, r: f'{text_of(t, 6)},{r[4:]},A69-1602-7001'),
+}  # fmt: skip
+"""By maker or network: the head of an export, and a line of it, of the time and the receiver
+`VR2-...`, whose number is what follows."""
+
+
 def line(count=80, step=1.0):
     """A dive of ever new legs, with the noise of a USBL."""
     seconds = step * np.arange(count)
@@ -128,15 +153,19 @@ def minutes(value, width):
     return f'{int(value):0{width}d}{value % 1 * 60:08.5f}'
 
 
+def position(kind, moment, place=sonar_files.PLACE, talker='GP'):
+    """A sentence RMC or GGA."""
+    where, clock = f'{minutes(place[0], 2)},N,{minutes(place[1], 3)},E', f'{moment:%H%M%S}.00'
+    if kind == 'GGA':
+        return checked(f'{talker}GGA,{clock},{where},4,08,0.9,2.0,M,40.0,M,,')
+    return checked(f'{talker}RMC,{clock},A,{where},1.0,90.0,{moment:%d%m%y},,')
+
+
 def nmea(path, spots):
     pytest.importorskip('pynmea2')
     pytest.importorskip('pyais')
-    lines = []
-    for each in spots:
-        moment = BEGIN + timedelta(seconds=each.seconds)
-        where = f'{minutes(each.degrees[0], 2)},N,{minutes(each.degrees[1], 3)},E'
-        lines.append(checked(f'GPRMC,{moment:%H%M%S}.00,A,{where},1.0,90.0,{moment:%d%m%y},,'))
-        lines.append(checked(f'GPGGA,{moment:%H%M%S}.00,{where},4,08,0.9,2.0,M,40.0,M,,'))
+    moments = [(BEGIN + timedelta(seconds=each.seconds), each.degrees) for each in spots]
+    lines = [position(kind, *each) for each in moments for kind in ('RMC', 'GGA')]
     path.write_text('\r\n'.join(lines) + '\r\n')
 
 

@@ -8,6 +8,7 @@
 
 """The arrays of the reference vectors."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,3 +20,14 @@ def load_vectors(name):
     """Return the arrays of ``test/vectors/NAME.npz`` by their names."""
     with np.load(FOLDER / f'{name}.npz', allow_pickle=False) as file:
         return {key: file[key] for key in file}
+
+
+@cache
+def _at_sea():
+    return load_vectors('diver_sea/diver_sea')
+
+
+def vectors(group):
+    """The arrays of a group of those of a diver at sea, by their names in it."""
+    named = ((*name.split('/'), value) for name, value in _at_sea().items())
+    return {name: value for its, name, value in named if its == group}

@@ -14,8 +14,7 @@ import sys
 from typing import get_args
 
 import attrs
-from helpers.hostile.properties import check_refusal
-from helpers.hostile.runs import mutated, MUTATIONS
+from helpers.hostile.runs import check_refusal, mutated, MUTATIONS
 from helpers.hostile.streams import templates
 from helpers.marine import driver_message, OTHERS
 import numpy as np

@@ -14,7 +14,7 @@ import re
 import time
 from types import SimpleNamespace
 
-from helpers.hostile.states import forge, parts_of
+from helpers.hostile.files import forge, parts_of
 from helpers.node_bench import a_fix, Rig
 import numpy as np
 import pytest

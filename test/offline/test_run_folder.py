@@ -18,8 +18,7 @@ import shutil
 import signal
 import sys
 
-from helpers.dive_bags import write_dive
-from helpers.dive_scenes import single_run, START_NS
+from helpers.dive_scenes import single_run, START_NS, write_dive
 from helpers.estimates import same
 import numpy as np
 import pytest

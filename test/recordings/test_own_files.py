@@ -13,7 +13,7 @@ import json
 import shutil
 
 from helpers.commands import run
-from helpers.dive_bags import write_dive
+from helpers.dive_scenes import write_dive
 import numpy as np
 import pytest
 

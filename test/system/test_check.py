@@ -23,7 +23,7 @@ import sys
 import time
 
 from helpers.commands import children
-from helpers.dive_bags import write_dive
+from helpers.dive_scenes import write_dive
 from helpers.faults.rig import wait_until_ready
 from helpers.source import ROOT
 import pytest

@@ -26,8 +26,7 @@ from unittest.mock import patch
 import zipfile
 
 import attrs
-from helpers.hostile.files import RECORDED, states_damaged
-from helpers.hostile.states import forge, parts_of, places_in, sealed
+from helpers.hostile.files import forge, parts_of, places_in, RECORDED, sealed, states_damaged
 from helpers.tracked import BAGS, resumed, saved, tracked, tracker_from
 import numpy as np
 import pytest

@@ -25,6 +25,7 @@ from attrs import define, field
 from hypothesis import strategies as st
 import numpy as np
 
+from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import inputs_of, made_inputs
 from msg_adapters.table import DATATYPES
 from sonar_imm.intake import Intake
@@ -33,7 +34,6 @@ from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.recordings.measurements import DetectedImages
 
-from .properties import check_estimate, check_refusal
 from .streams import (
     clone,
     IMAGES,
@@ -275,6 +275,56 @@ def _encode(message, columns, rng, strange=False):
     message.fields, message.is_bigendian = fields, order == '>'
     message.height, message.width, message.point_step = height, width, offset
     message.row_step, message.data = lines.shape[1], np.ascontiguousarray(lines).ravel()
+
+
+# -- what must hold of every refusal and of every estimate --------------------------------------
+
+ROUNDING = 1e-9
+
+
+def check_refusal(rejection):
+    """A reason to count, and a sentence to show."""
+    assert rejection.reason and ' ' not in rejection.reason, rejection.reason
+    assert rejection.sentence and '\n' not in rejection.sentence
+    assert len(rejection.sentence) < 2000
+
+
+def check_estimate(estimate):
+    """`check_numbers`, and that a message can hold it."""
+    check_numbers(estimate)
+    write_estimate(estimate, make)
+
+
+def check_numbers(estimate):
+    """Numbers that are finite where they must be, covariances, probabilities."""
+    valid = np.asarray(estimate.extras.get('valid', np.ones(len(estimate))), bool)
+    if estimate.state_names == ('depth', 'amplitude') and len(estimate) == 1:
+        valid = estimate.extras['existence'] > 0.0  # a row that says that there is no reflector
+    state, covariance = estimate.state[valid], estimate.covariance[valid]
+    for name, values in (('state', state), ('covariance', covariance)):
+        assert np.isfinite(values).all(), f'{name} {values}'
+    check_covariances(covariance)
+    probabilities = estimate.probabilities
+    if probabilities.size:
+        assert ((probabilities >= 0.0) & (probabilities <= 1.0)).all(), probabilities
+        wrong = np.abs(probabilities.sum(axis=1) - 1.0).max()
+        assert wrong < ROUNDING, f'probabilities sum to one but for {wrong}'
+    for name, column in estimate.extras.items():
+        assert len(column) == len(estimate), name
+        if name in ('existence', 'label_probability', 'label_confidence'):
+            assert not ((column < 0.0) | (column > 1.0)).any(), f'{name} {column}'
+
+
+def check_covariances(covariance):
+    """(n, d, d): symmetric, and no eigenvalue of the correlations below zero but for rounding."""
+    if not covariance.size:
+        return
+    assert (covariance == np.swapaxes(covariance, -1, -2)).all(), 'not symmetric'
+    own = np.diagonal(covariance, axis1=-2, axis2=-1)
+    assert (own >= 0.0).all(), f'a variance below zero: {own}'
+    std = np.sqrt(np.where(own > 0.0, own, 1.0))
+    least = np.linalg.eigvalsh(covariance / std[:, :, None] / std[:, None, :]).min()
+    assert least > -ROUNDING, f'an eigenvalue of a correlation is {least}'
 
 
 # -- runs ---------------------------------------------------------------------------------------

@@ -213,15 +213,13 @@ WORDS_OF_TRACES = [
 
 
 def test_what_cannot_be_converted_is_said_in_a_sentence(archived):
-    for options, arrays, word in WORDS:
+    of_traces = [('traces', {}, {**TRACES, **arrays}, word) for arrays, word in WORDS_OF_TRACES]
+    for kind, options, arrays, word in [*(('snapshots', *each) for each in WORDS), *of_traces]:
         with pytest.raises(BagError, match=word):
-            archived('snapshots', options, **arrays)
-    for arrays, word in WORDS_OF_TRACES:
-        with pytest.raises(BagError, match=word):
-            archived('traces', **{**TRACES, **arrays})
+            archived(kind, options, **arrays)
 
 
-def test_archives_that_unpack_to_far_more_or_hold_others_cost_a_sentence(tmp_path):
+def test_archives_that_unpack_to_far_more_or_hold_others_and_other_files_cost_a_sentence(tmp_path):
     head = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (%d,)}"
     npy = head % 10**15 + b' ' * 64
     np.savez(tmp_path / 'inner.npz', iq=samples(10, 4))
@@ -236,18 +234,13 @@ def test_archives_that_unpack_to_far_more_or_hold_others_cost_a_sentence(tmp_pat
             archive.writestr(part, content)
         with pytest.raises(BagError, match=words):
             convert_snapshots(tmp_path / 'a.npz', tmp_path / 'bag')
-
-
-def test_other_files_are_refused(tmp_path):
     np.save(tmp_path / 'single.npy', np.ones(3))
     np.savez_compressed(tmp_path / 'cut.npz', iq=samples(500, 4), range=np.arange(500.0))
-    data = (tmp_path / 'cut.npz').read_bytes()
-    broken = data[:200] + bytes(len(data) // 2) + data[200 + len(data) // 2 :]
-    (tmp_path / 'cut.npz').write_bytes(broken)
-    for name, words in (
-        ('nothing.npz', 'cannot be read'), ('single.npy', 'not a numpy archive'),
-        ('cut.npz', 'damaged'),
-    ):  # fmt: skip
+    data = bytearray((tmp_path / 'cut.npz').read_bytes())
+    data[200 : 200 + len(data) // 2] = bytes(len(data) // 2)
+    (tmp_path / 'cut.npz').write_bytes(data)
+    refused = {'nothing.npz': 'cannot be read', 'single.npy': 'not a numpy archive'}
+    for name, words in {**refused, 'cut.npz': 'damaged'}.items():
         with pytest.raises(BagError, match=words):
             convert_snapshots(tmp_path / name, tmp_path / 'bag')
 
@@ -351,14 +344,14 @@ def test_a_time_that_does_not_matter(tmp_path):
 
 
 def test_wave_files_of_the_other_byte_order_and_those_that_were_cut(tmp_path):
-    samples = write_sound(tmp_path / 'a.wav', endian='BIG')
-    content = (tmp_path / 'a.wav').read_bytes()
-    assert content[:4] == b'RIFX' and sniff(tmp_path / 'a.wav').kind == 'hydrophones'
-    write_sound(tmp_path / 'b.wav')
-    content = (tmp_path / 'b.wav').read_bytes()
-    (tmp_path / 'b.wav').write_bytes(content[: len(content) // 2])
-    for name, least, most in (('a.wav', 10_000, 10_000), ('b.wav', 4001, 5000)):
-        found = joined(convert_hydrophones(tmp_path / name, tmp_path / f'{name}.bag', start='0'))
+    for endian, least, most in (('BIG', 10_000, 10_000), ('LITTLE', 4001, 5000)):
+        path = tmp_path / f'{endian}.wav'
+        samples = write_sound(path, endian=endian)
+        content = path.read_bytes()
+        assert content[:4] == {'BIG': b'RIFX', 'LITTLE': b'RIFF'}[endian]
+        path.write_bytes(content if endian == 'BIG' else content[: len(content) // 2])
+        assert sniff(path).kind == 'hydrophones'
+        found = joined(convert_hydrophones(path, tmp_path / endian, start='0'))
         assert least <= len(found) <= most
         assert found == pytest.approx(samples[: len(found)], abs=1e-6)
 

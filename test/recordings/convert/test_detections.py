@@ -10,19 +10,15 @@
 
 import shutil
 
-from helpers.field_files import measured, text_of
+from helpers.field_files import MAKERS, measured, text_of
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from sonar_imm_tools.recordings.convert import (
-    convert_arrivals,
-    convert_detections,
-    CsvOptions,
-    sniff,
-)
+from sonar_imm_tools.recordings.convert import convert_arrivals, convert_detections, sniff
 from sonar_imm_tools.recordings.convert.detections import compare_clocks, gather, Received
 from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.tables import CsvOptions
 
 SECOND, SPEED, BEGIN = 10**9, 1480.0, 1_717_149_600 * 10**9
 RECEIVERS = np.array(
@@ -120,9 +116,8 @@ def converted(folder, rows, **options):
     places = [(f'r{k}', *place) for k, place in enumerate(RECEIVERS)]
     stations = write_csv(folder / 'stations.csv', 'receiver,x,y,z', places)
     fixed = [(name, *place) for name, place in zip(names, SYNC)]
-    sync = write_csv(folder / 'sync.csv', 'tag,x,y,z', fixed)
-    options = {'sync': sync, 'sound_speed': SPEED, **options}
-    return convert_detections(vue, folder / 'out', receivers=stations, **options)
+    usual = {'sync': write_csv(folder / 'sync.csv', 'tag,x,y,z', fixed), 'sound_speed': SPEED}
+    return convert_detections(vue, folder / 'out', receivers=stations, **{**usual, **options})
 
 
 def test_arrivals_of_a_tag_fit_the_place_it_had(tmp_path):
@@ -173,6 +168,7 @@ def heard(period=30.0, pings=20):
 
 
 def exported(folder, head, line, rows=None, **options):
+    shutil.rmtree(folder / 'out', ignore_errors=True)
     lines = [[line(t, name)] for t, name in rows or heard()]
     export = write_csv(folder / 'export.csv', head, lines)
     places = [(name, x, y, -3) for name, (x, y) in STATIONS.items()]
@@ -188,38 +184,9 @@ def of_vue(t, r, digits=6):
     return f'{text_of(t, digits)},{r},7'
 
 
-VDAT = (
-    'VEMCO DATA LOG,2.0.0,vdat\nRECORD TYPE,FIELD\nDIAG_DESC,Device Time (UTC),Model\n'
-    'DET_DESC,Device Time (UTC),Time,Model,Serial Number,Channel,Full ID,ID'
-)
-
-
-@pytest.mark.parametrize(
-    'head, line',
-    [
-        ('station,receiver,tagName,codeSpace,dateCollectedUTC',
-         lambda t, r: f'S1,{r},A69-1602-7001,A69-1602,{text_of(t, 6)}'),
-        ('animal_id,detection_timestamp_utc,transmitter_codespace,transmitter_id,receiver_sn',
-         lambda t, r: f'9,{text_of(t, 6)},A69-1602,7001,{r}'),
-        ('date_time,tag_serial_number,acoustic_tag_id,receiver_id,station_name',
-         lambda t, r: f'{text_of(t, 6)},1187,A69-1602-7001,{r},bh'),
-        ('Timestamp,Receiver,CodeSpace,Signal,Valid',
-         lambda t, r: f'{text_of(t, 6)},{r},A69-1602,7001,TRUE'),
-        ('Date,Time,TOA,Tag ID,Receiver,Power',
-         lambda t, r: f'{text_of(t, 0, "%m/%d/%y")},{text_of(t, 0, "%H:%M:%S")},{t % 1:.6f},'
-                      f'A69-1602-7001,{r},147'),
-        ('Date and Time (UTC),ID,Data,Protocol,Receiver,Microsecond',
-         lambda t, r: f'{text_of(t, 0)},A69-1602-7001,0,S256,{r},{int(t % 1 * 1e6)}'),
-        (VDAT,
-         lambda t, r: f'DIAG,{text_of(t, 6)},{r[:3]}\n'
-                      f'DET,{2 * (text_of(t, 6) + ",")}VR2,{r[4:]},69,A69-1602-7001,7001'),
-        ('Date and Time (UTC),Receiver,Transmitter',
-         lambda t, r: f'{text_of(t, 6)},{r[4:]},A69-1602-7001'),
-    ],
-    ids='otn glatos etn actel lotek thelma vdat serial_number'.split(),
-)  # fmt: skip
-def test_exports_of_makers_and_networks(tmp_path, head, line):
-    report = exported(tmp_path, head, line)
+@pytest.mark.parametrize('name', MAKERS)
+def test_exports_of_makers_and_networks(tmp_path, name):
+    report = exported(tmp_path, *MAKERS[name])
     assert (report.bad_rows, report.messages) == (0, {'/arrivals': 20})
     assert 'A69-1602-7001 is 1' in report.notes['tag']
     first = measured(report.path)[0]
@@ -234,21 +201,15 @@ def test_pings_within_a_second_are_not_joined(tmp_path):
     for period, words in ((0.7, '0.35 s'), (1.0, '0.5 s'), (30.0, '')):
         report = exported(tmp_path, VUE, of_vue, heard(period))
         assert report.messages == {'/arrivals': 20} and words in report.notes.get('window', '')
-        shutil.rmtree(tmp_path / 'out')
     # Those faster than sound crosses the array, and one receiver alone, are questions.
     with pytest.raises(BagError, match='each 0.2 s, and sound takes 0.226 s.*--window 0.23'):
         exported(tmp_path, VUE, of_vue, heard(0.2))
     assert exported(tmp_path, VUE, of_vue, heard(0.2), window=0.23).messages
-    shutil.rmtree(tmp_path / 'out')
     report = exported(tmp_path, VUE, of_vue, [row for row in heard() if row[1] == 'VR2-101'])
     assert 'all detections are of VR2-101' in report.questions[0]
-    shutil.rmtree(tmp_path / 'out')
-
-    def marked(t, r):
-        return f'{of_vue(t, r)},{"FALSE" if r == "VR2-101" else "TRUE"}'
-
     # Detections that are marked as invalid are left out.
-    report = exported(tmp_path, 'Timestamp,Receiver,Transmitter,Valid', marked)
+    marked = tmp_path, f'{VUE},Valid', lambda t, r: f'{of_vue(t, r)},{r != "VR2-101"}'
+    report = exported(*marked)
     assert report.bad_rows == 20 and set(measured(report.path)[0].rx_id) == {2, 3, 4}
 
 
@@ -259,18 +220,14 @@ def test_the_resolution_of_stamps_is_said_and_heeded(tmp_path):
     assert '1 s, 1.5e+03 m' in caught.value.sentence and '--toa-std 0.29' in caught.value.sentence
     assert exported(*whole, toa_std=0.29).messages == {'/arrivals': 20}
     for digits, std, words in ((1, 0.1, '0.1 s, 150 m'), (2, 0.01, '0.01 s'), (6, None, '')):
-        shutil.rmtree(tmp_path / 'out')
         report = exported(tmp_path, VUE, lambda t, r, digits=digits: of_vue(t, r, digits))
         assert words in report.notes.get('resolution', '')
         var = measured(report.path)[0].var_toa
         assert var == pytest.approx(std**2 / 12) if std else np.isnan(var).all()
-
     # Days of five digits have one too.
-    def days(t, r):
-        return f'{t / 86400 + 25569:.5f},{r},7'
-
+    head = 'excel_time,Receiver,Transmitter'
     with pytest.raises(BagError, match='a resolution of 0.864 s'):
-        exported(tmp_path, 'excel_time,Receiver,Transmitter', days)
+        exported(tmp_path, head, lambda t, r: f'{t / 86400 + 25569:.5f},{r},7')
 
 
 # -- tables of arrival times
@@ -339,14 +296,10 @@ def test_bad_rows_are_named(arrivals):
     assert report.bad_rows == 6 and len(measured(report.path)) == 1
     text = ' / '.join(report.problems)
     for words in (
-        "line 5: receiver '2' is listed twice",
-        'line 6: the receiver has no name',
-        "line 7: x is 'x'",
-        "line 3: the position of receiver '9'",
-        'line 4: the ping is empty',
-        "line 5: arrival is 'x'",
-    ):
-        assert words in text
+        "5: receiver '2' is listed twice", '6: the receiver has no name', "7: x is 'x'",
+        "3: the position of receiver '9'", '4: the ping is empty', "5: arrival is 'x'",
+    ):  # fmt: skip
+        assert f'line {words}' in text
 
 
 def test_names_of_receivers_and_tags_are_numbered_and_told(arrivals):

@@ -21,7 +21,7 @@ import subprocess
 import sys
 import time
 
-from helpers.dive_bags import write_dive
+from helpers.dive_scenes import write_dive
 from helpers.faults.cases import BAGS, CASES
 from helpers.faults.figures import count, long_form
 from helpers.source import ROOT

@@ -11,7 +11,7 @@ at a time."""
 
 from attrs import evolve
 from helpers.diver_runs import arrivals, both_sides, followed, miss, numbers_of, SECOND
-from helpers.sea_vectors import vectors
+from helpers.vector_files import vectors
 import numpy as np
 from oracles.robust import student_t_maximum, subset_update
 import pytest
