@@ -231,22 +231,17 @@ def test_xyz_las_and_tif_hold_the_same_floor(tracked, tmp_path):
     assert np.nanmean(depth) == pytest.approx(18.5, abs=0.2)
 
 
-@pytest.mark.parametrize(
-    'words, said',
-    [
-        ('a.pdf', '.xyz, .las, .laz, .tif'),
-        ('a.tif --epsg 1', 'EPSG number 1'),
-        ('a.tif --cell 0.00001', 'too large'),
-        ('a.xyz --origin 5', 'X,Y'),
-        ('a.tif --cell 0', 'cell'),
-    ],
-)
-def test_mistakes_are_one_sentence(tracked, tmp_path, capsys, words, said):
+def test_mistakes_are_one_sentence(tracked, tmp_path, capsys):
     pytest.importorskip('rasterio')
-    name, *options = words.split()
-    assert run('export', tracked, tmp_path / name, *options) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count('\n') == 1 and not (tmp_path / name).exists()
+    for words, said in (
+        ('a.pdf', '.xyz, .las, .laz, .tif'), ('a.tif --epsg 1', 'EPSG number 1'),
+        ('a.tif --cell 0.00001', 'too large'), ('a.xyz --origin 5', 'X,Y'),
+        ('a.tif --cell 0', 'cell'),
+    ):  # fmt: skip
+        name, *options = words.split()
+        assert run('export', tracked, tmp_path / name, *options) == 2
+        error = capsys.readouterr().err
+        assert said in error and error.count('\n') == 1 and not (tmp_path / name).exists()
 
 
 def test_runs_without_soundings_and_files_in_the_way_are_named(tracked, tmp_path, capsys):

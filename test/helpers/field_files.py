@@ -153,15 +153,19 @@ def minutes(value, width):
     return f'{int(value):0{width}d}{value % 1 * 60:08.5f}'
 
 
+def position(kind, moment, place=sonar_files.PLACE, talker='GP'):
+    """A sentence RMC or GGA."""
+    where, clock = f'{minutes(place[0], 2)},N,{minutes(place[1], 3)},E', f'{moment:%H%M%S}.00'
+    if kind == 'GGA':
+        return checked(f'{talker}GGA,{clock},{where},4,08,0.9,2.0,M,40.0,M,,')
+    return checked(f'{talker}RMC,{clock},A,{where},1.0,90.0,{moment:%d%m%y},,')
+
+
 def nmea(path, spots):
     pytest.importorskip('pynmea2')
     pytest.importorskip('pyais')
-    lines = []
-    for each in spots:
-        moment = BEGIN + timedelta(seconds=each.seconds)
-        where = f'{minutes(each.degrees[0], 2)},N,{minutes(each.degrees[1], 3)},E'
-        lines.append(checked(f'GPRMC,{moment:%H%M%S}.00,A,{where},1.0,90.0,{moment:%d%m%y},,'))
-        lines.append(checked(f'GPGGA,{moment:%H%M%S}.00,{where},4,08,0.9,2.0,M,40.0,M,,'))
+    moments = [(BEGIN + timedelta(seconds=each.seconds), each.degrees) for each in spots]
+    lines = [position(kind, *each) for each in moments for kind in ('RMC', 'GGA')]
     path.write_text('\r\n'.join(lines) + '\r\n')
 
 

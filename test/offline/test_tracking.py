@@ -149,29 +149,26 @@ def test_yaml_json_and_the_message_say_the_same(tmp_path):
 
 
 def test_a_bad_file_gets_one_sentence(tmp_path):
+    good = {'position': [1, 2], 'covariance': [1, 0, 0, 1]}
     for text, words in (
-        ('', 'the file is empty'),
-        ('[]', 'the file is empty'),
-        ('3', 'a place needs position and covariance'),
-        ('{position: [1, 2]}', 'covariance is missing'),
-        ('{covariance: [1, 0, 0, 1]}', 'position is missing'),
-        ('{position: [1], covariance: [1, 0, 0, 1]}', 'two or three numbers'),
+        ('', 'the file is empty'), ('[]', 'the file is empty'), ('pose: 3', 'pose needs'),
+        ('3', 'a place needs position and covariance'), ('{position: [1, 2', 'not a YAML file'),
+        ({'position': [1, 2]}, 'covariance is missing'),
+        ({'covariance': [1, 0, 0, 1]}, 'position is missing'),
+        ({**good, 'position': [1]}, 'two or three numbers'),
         ('{position: [1, .nan], covariance: [1, 0, 0, 1]}', 'not finite'),
-        ('{position: [1, two], covariance: [1, 0, 0, 1]}', "'two' in place of a number"),
-        ('{position: [1, 2], covariance: [1, 0, 0]}', '4, 9 or 36 numbers'),
-        ('{position: [1, 2], covariance: [0, 0, 0, 0]}', 'covariance'),
-        ('{position: [1, 2], covariance: [1, 5, 5, 1]}', 'covariance'),
-        ('{position: [1, 2], covariance: [1, 0, 0, 1], time: noon}', "time 'noon'"),
-        ('{position: [1, 2], covariance: [1, 0, 0, 1], where: here}', 'where is not one of'),
-        ('[{position: [1, 2], covariance: [1, 0, 0, 1]}, 7]', 'place 2:'),
-        ('{position: [1, 2', 'not a YAML file'),
-        ('pose: 3', 'pose needs'),
-    ):
+        ({**good, 'position': [1, 'two']}, "'two' in place of a number"),
+        ({**good, 'covariance': [1, 0, 0]}, '4, 9 or 36 numbers'),
+        ({**good, 'covariance': [0, 0, 0, 0]}, 'covariance'),
+        ({**good, 'covariance': [1, 5, 5, 1]}, 'covariance'),
+        ({**good, 'time': 'noon'}, "time 'noon'"),
+        ({**good, 'where': 'here'}, 'where is not one of'), ([good, 7], 'place 2:'),
+    ):  # fmt: skip
         with pytest.raises(ConfigError, match='--initial') as caught:
             read_initial(written(tmp_path, text))
         assert words in str(caught.value) and '\n' not in str(caught.value)
-        with pytest.raises(ConfigError, match='No such file'):
-            read_initial(tmp_path / 'nothing.yaml')
+    with pytest.raises(ConfigError, match='No such file'):
+        read_initial(tmp_path / 'nothing.yaml')
 
 
 def test_a_track_begins_where_and_when_the_file_says(tmp_path, capsys):
@@ -293,19 +290,16 @@ def test_a_good_recording_has_no_problems_and_refused_messages_are_told(tmp_path
     assert problem.startswith('3 messages refused as fix (nan): ')
 
 
-@pytest.mark.parametrize(
-    'seconds, words',
-    [
+def test_odd_stamps_and_several_frames_are_told(tmp_path):
+    for k, (seconds, words) in enumerate((
         ([0, 1, 2, 1.5, 3], '1 stamps older than the one before, by up to 0.5 s'),
         ([0, 1, 2, 3, 40, 41], '1 gaps in the stamps, the longest 37 s against 1 s'),
         ([None, None, 1], '2 messages without a usable stamp'),
-    ],
-)
-def test_odd_stamps_and_several_frames_are_told(tmp_path, seconds, words):
-    _, topics = said_of(write_stamps(tmp_path / 'bag', seconds, frames=('map', 'odom')))
-    problems = topics['/fix']['problems']
-    assert any(words in problem for problem in problems)
-    assert "several frames: 'map', 'odom'" in problems
+    )):  # fmt: skip
+        bag = write_stamps(tmp_path / f'{k}', seconds, frames=('map', 'odom'))
+        problems = said_of(bag)[1]['/fix']['problems']
+        assert any(words in problem for problem in problems)
+        assert "several frames: 'map', 'odom'" in problems
 
 
 def test_several_fixes_of_one_stamp_are_a_scan_and_two_pings_a_problem(tmp_path, capsys):

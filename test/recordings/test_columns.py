@@ -59,9 +59,8 @@ def test_headers_in_six_languages(table):
     assert (made.index['latitude'], made.index['longitude']) == (3, 4)
 
 
-@pytest.mark.parametrize(
-    'name, header, cell, value',
-    [
+def test_units_of_headers_are_heeded(table):
+    for name, header, cell, value in (
         ('x', 'East (km)', 1.5, 1500.0), ('x', 'x_cm', 150, 1.5),
         ('depth', 'Depth (ft)', 10, 3.048), ('depth', 'depth_ft', 10, 3.048),
         ('depth', 'Depth (below surface)', 10, 10), ('depth', 'Tiefe [m]', 10, 10),
@@ -73,11 +72,9 @@ def test_headers_in_six_languages(table):
         ('bearing', 'bearing_deg', 180, 3.14159265), ('bearing', 'Peilung [°]', 180, 3.14159265),
         ('x', 'Est (pieds)', 10, 3.048), ('x', 'East [yd]', 100, 91.44),
         ('y', 'X (North)', 3, 3), ('x', 'Y (Rechtswert)', 3, 3),
-    ],
-)  # fmt: skip
-def test_units_of_headers_are_heeded(table, name, header, cell, value):
-    (row,) = table(f'{header};time\n{cell};1\n')
-    assert row.number(name) == pytest.approx(value, rel=1e-5)
+    ):  # fmt: skip
+        (row,) = table(f'{header};time\n{cell};1\n')
+        assert row.number(name) == pytest.approx(value, rel=1e-5), header
 
 
 def test_a_unit_of_another_kind_is_refused(table):
@@ -209,22 +206,19 @@ def test_words_for_bad_rows(table):
                 row.require_valid()
 
 
-@pytest.mark.parametrize(
-    'header, cells, named',
-    [('Kurs [°]', '{c}', 'Kurs'), ('heading', '{c}', 'heading'), ('SNR [dB];no', '{c};{k}', ''),
-     ('Rumbo buque', '{k}', 'Rumbo buque'), ('ship speed', '3', 'ship speed'),
-     ('pos1;pos2', '59.4{c};10.4{c}', 'pos1, pos2'), ('note;port', 'a{k};7', '')],
-)  # fmt: skip
-def test_columns_that_may_be_the_vessel_are_a_question(convert, header, cells, named):
-    rows = [f'{k};50;{k}0;' + cells.format(k=k, c=k * k + 3) for k in range(1, 9)]
-    text = '\n'.join([f'time;range;bearing_deg;{header}', *rows]) + '\n'
-    if named:
-        with pytest.raises(BagError) as caught:
-            convert(text)
-        assert named in caught.value.sentence and '--bearings north' in caught.value.sentence
-        convert(text, bearings='north')
-    else:
-        assert convert(text).messages == {'/fix': 8}
+def test_columns_that_may_be_the_vessel_are_a_question(convert):
+    for header, cells, named in (
+        ('Kurs [°]', '{c}', 'Kurs'), ('heading', '{c}', 'heading'), ('SNR [dB];no', '{c};{k}', ''),
+        ('Rumbo buque', '{k}', 'Rumbo buque'), ('ship speed', '3', 'ship speed'),
+        ('pos1;pos2', '59.4{c};10.4{c}', 'pos1, pos2'), ('note;port', 'a{k};7', ''),
+    ):  # fmt: skip
+        rows = [f'{k};50;{k}0;' + cells.format(k=k, c=k * k + 3) for k in range(1, 9)]
+        text = '\n'.join([f'time;range;bearing_deg;{header}', *rows]) + '\n'
+        if named:
+            with pytest.raises(BagError, match=f'{re.escape(named)}.*--bearings north'):
+                convert(text)
+        how = {'bearings': 'north'} if named else {}
+        assert convert(text, out=header, **how).messages == {'/fix': 8}
 
 
 def test_the_heading_of_a_vessel_is_asked_for_by_the_columns_that_are_left(convert, tmp_path):
@@ -244,26 +238,22 @@ def test_columns_that_are_zero_throughout_give_way_to_filled_ones(convert):
     assert 'latitude = Lat' in notes['columns of in.csv']
 
 
-@pytest.mark.parametrize(
-    'header, cells, words',
-    [('lat,Latitude,lon', '59.0,59.1,10', 'Latitude and lat may both be latitude'),
-     ('lat,Latitude,lon', '59.1,59.1,10', ''), ('Depth (m),Depth (ft)', '10,32.8', ''),
-     ('lat,target_lat,lon,target_lon', '59.0,59.1,10,11', ''),
-     ('Depth (m),Tiefe', '10,32.8', 'may both be depth'),
-     ('heading,gyro', '90,95', 'may both be heading'), ('east,easting', '1,2', 'both be x')],
-)  # fmt: skip
-def test_two_columns_of_one_quantity_are_a_question(table, header, cells, words):
-    text = f'time,{header}\n1,{cells}\n'
-    (row,) = made = table(text)
-    quantity = next(name for name in ('latitude', 'depth', 'heading', 'x') if name in made.index)
-    if not words:
-        assert row.number(quantity) > 0.0
-        return
-    with pytest.raises(BagError, match=words):
-        row.number(quantity)
-    for name in header.split(',')[:2]:
-        (row,) = table(text, columns={quantity: name})
-        assert row.number(quantity) > 0.0
+def test_two_columns_of_one_quantity_are_a_question(table):
+    for name, header, cells, words in (
+        ('latitude', 'lat,Latitude,lon', '59.0,59.1,10', 'Latitude and lat may both be latitude'),
+        ('latitude', 'lat,Latitude,lon', '59.1,59.1,10', ''),
+        ('latitude', 'lat,target_lat,lon,target_lon', '59.0,59.1,10,11', ''),
+        ('depth', 'Depth (m),Depth (ft)', '10,32.8', ''),
+        ('depth', 'Depth (m),Tiefe', '10,32.8', 'may both be depth'),
+        ('heading', 'heading,gyro', '90,95', 'may both be heading'),
+        ('x', 'east,easting', '1,2', 'both be x'),
+    ):
+        text, ways = f'time,{header}\n1,{cells}\n', [{}]
+        if words:
+            with pytest.raises(BagError, match=words):
+                next(iter(table(text))).number(name)
+            ways = [{name: column} for column in header.split(',')[:2]]
+        assert all(next(iter(table(text, columns=how))).number(name) > 0.0 for how in ways)
 
 
 def test_metres_and_degrees_that_disagree_are_a_question(convert):
@@ -315,27 +305,24 @@ def test_positions_beside_range_and_bearing_are_a_question(convert):
         assert convert(text, 'relative', f'{places}2', options=how).messages['/relative'] == 8
 
 
-@pytest.mark.parametrize(
-    'kind, header, asked',
-    [
+def test_bearings_whose_word_is_of_another_direction_are_a_question(convert):
+    parts = {'relative': ('boat_x;boat_y;heading;range', '0;{k};90;50'), 'fixes': ('range', '50')}
+    for kind, header, asked in (
         ('relative', 'Azimut [°]', True), ('relative', 'Demora (°)', True),
         ('relative', 'Bearing true (deg)', True), ('relative', 'Gisement [deg]', False),
         ('relative', 'bearing_deg', False), ('fixes', 'Gisement [deg]', True),
         ('fixes', 'relative_bearing_deg', True), ('fixes', 'Relèvement [deg]', False),
-    ],
-)  # fmt: skip
-def test_bearings_whose_word_is_of_another_direction_are_a_question(convert, kind, header, asked):
-    head = {'relative': 'time;boat_x;boat_y;heading;range', 'fixes': 'time;range'}[kind]
-    cells = {'relative': '0;{k};90;50', 'fixes': '50'}[kind]
-    rows = ''.join(f'{k};{cells.format(k=k)};{k}0\n' for k in range(1, 9))
-    text = f'{head};{header}\n{rows}'
-    if not asked:
-        assert convert(text, kind).messages
-        return
-    with pytest.raises(BagError, match='--bearings (bow or --bearings north|north or --bear)'):
-        convert(text, kind)
-    for bearings in ('north', 'bow') if kind == 'relative' else ():
-        assert convert(text, kind, f'out_{bearings}', bearings=bearings).messages
+    ):  # fmt: skip
+        head, cells = parts[kind]
+        rows = ''.join(f'{k};{cells.format(k=k)};{k}0\n' for k in range(1, 9))
+        text, ways = f'time;{head};{header}\n{rows}', [{}]
+        if asked:
+            with pytest.raises(BagError, match='--bearings (bow or --bearings n|north or --bear)'):
+                convert(text, kind)
+            known = ('north', 'bow') if kind == 'relative' else ()
+            ways = [{'bearings': bearings} for bearings in known]
+        for n, how in enumerate(ways):
+            assert convert(text, kind, f'{kind}{header}{n}', **how).messages
 
 
 def test_a_depth_that_is_not_tracked_is_said_and_the_advice_helps(convert):

@@ -114,12 +114,9 @@ def test_numbers_and_lines_and_what_was_taken(table, tmp_path):
     (row,) = table('x,y,z,vx,lat\n1.5, abc ,,inf,59 25.8 N\n')
     assert row.number('x') == 1.5 and row.optional('z') != row.optional('z')
     for name, words in (
-        ('y', "y is 'abc', not a number"),
-        ('latitude', "lat is '59 25.8 N', not a number"),
-        ('z', 'z is empty'),
-        ('vx', 'infinite'),
-        ('depth', 'depth is empty'),
-    ):
+        ('y', "y is 'abc', not a number"), ('latitude', "lat is '59 25.8 N', not a number"),
+        ('z', 'z is empty'), ('vx', 'infinite'), ('depth', 'depth is empty'),
+    ):  # fmt: skip
         with pytest.raises(BadRow, match=words):
             row.number(name)
     # Lines keep their numbers past comments and blanks.
@@ -242,9 +239,8 @@ def test_times_of_day_in_one_number_pass_minutes_and_hours(stamps):
         stamps('time,x', *(f'{clock},1' for clock in ('095958', '095959', '100000')))
 
 
-@pytest.mark.parametrize(
-    'header, cells, words, options',
-    [
+def test_two_readings_are_a_question_with_an_option_for_each(stamps):
+    for header, cells, words, options in (
         ('Date,Time', ['20210504,10203', '20210504,10204'], 'HHMMSS or seconds',
          {'HHMMSS': '2021-05-04 01:02:03', 's': '2021-05-04 02:50:03'}),
         ('time,x', ['736950.70795,1', '736950.70796,1', '736950.70797,1'],
@@ -255,15 +251,11 @@ def test_times_of_day_in_one_number_pass_minutes_and_hours(stamps):
          {'excel': '2023-03-15 12:00:00', 's': '1970-01-01 12:30:00.5'}),
         ('gps_time,x', ['1432980012.25,1', '1432980013.25,1'], 'GPS time, since 1980',
          {'gps': '2025-06-03 09:59:54.25', 's': '2015-05-30 10:00:12.25'}),
-    ],
-)  # fmt: skip
-def test_two_readings_are_a_question_with_an_option_for_each(
-    stamps, header, cells, words, options
-):
-    with pytest.raises(BagError, match=words):
-        stamps(header, *cells, time_zone='UTC')
-    for unit, wanted in options.items():
-        assert stamps(header, *cells, time_zone='UTC', time_unit=unit)[0] == ns(wanted)
+    ):  # fmt: skip
+        with pytest.raises(BagError, match=words):
+            stamps(header, *cells, time_zone='UTC')
+        for unit, wanted in options.items():
+            assert stamps(header, *cells, time_zone='UTC', time_unit=unit)[0] == ns(wanted)
 
 
 def test_the_order_of_a_date_is_asked_for_and_stated(stamps):

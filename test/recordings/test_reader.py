@@ -338,16 +338,12 @@ COUNT, NAME = (TOPICS, 0, 'message_count'), (TOPICS, 0, 'topic_metadata', 'name'
 def test_metadata_of_a_wrong_kind_are_told_and_the_files_are_read(write_fixes):
     path = write_fixes(3)
     text = (path / 'metadata.yaml').read_text()
+    wrong = ('many', -5, 10**20, 1e20)
     for place, value, sentence in (
-        (COUNT, 'many', 'message count of many'),
-        (COUNT, -5, 'message count of -5'),
-        (COUNT, 10**20, 'count of 100000000000000000000'),
-        (COUNT, 1e20, 'message count of 1e+20'),
-        (NAME, [5], 'is no text'),
-        (NAME, 5, 'is no text'),
-        (('files',), 'none', 'a list of files that is none'),
-        ((), '{[', ''),
-    ):
+        *((COUNT, value, f'message count of {value}') for value in wrong),
+        (NAME, [5], 'is no text'), (NAME, 5, 'is no text'),
+        (('files',), 'none', 'a list of files that is none'), ((), '{[', ''),
+    ):  # fmt: skip
         metadata = yaml.safe_load(text)
         inside = metadata['rosbag2_bagfile_information']
         for key in place[:-1]:

@@ -174,21 +174,21 @@ def choose_again():
     export._arrow.cache_clear()
 
 
-def test_pyarrow_writes_them_where_it_is_there():
+def of_other_digits(column, arrow):
+    return arrow.array(['1'] * len(column))
+
+
+@pytest.mark.usefixtures('choose_again')
+def test_the_same_bytes_without_pyarrow_or_one_of_other_digits(monkeypatch):
     pytest.importorskip('pyarrow')
     assert export._arrow() is not None
-
-
-@pytest.mark.parametrize('digits', ['none', 'others'])
-def test_the_same_bytes_without_pyarrow_or_one_of_other_digits(monkeypatch, choose_again, digits):
-    if digits == 'none':
-        monkeypatch.setitem(sys.modules, 'pyarrow', None)
-    else:
-        pytest.importorskip('pyarrow')
-        other = '_texts', lambda column, arrow: arrow.array(['1'] * len(column))
-        monkeypatch.setattr(export, *other)
-    assert export._arrow() is None
-    assert written([SPREAD, SPREAD]) == plain([SPREAD, SPREAD])
+    changes = (sys.modules, 'pyarrow', None), (vars(export), '_texts', of_other_digits)
+    for change in changes:
+        export._arrow.cache_clear()
+        with monkeypatch.context() as patches:
+            patches.setitem(*change)
+            assert export._arrow() is None
+            assert written([SPREAD, SPREAD]) == plain([SPREAD, SPREAD])
 
 
 # -- scenes become bags: each class by its own writer, in the order of reception

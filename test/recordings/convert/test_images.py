@@ -60,12 +60,10 @@ def refused(capsys, *arguments):
 
 @pytest.fixture
 def bag(tmp_path):
-    records = []
-    for k in range(1, 7):
-        picture = image(k, 0 if k == 4 else 60 - k, spoilt=k == 6)
-        records.append((k * 10**9, '/fls/image', picture))
-        records.append((k * 10**9 + 1, '/auv/odometry', pose_at(k * 10**9, 0.5 * k)))
-    return marine.write_bag(tmp_path / 'survey', records)
+    seen = [(k, image(k, 0 if k == 4 else 60 - k, spoilt=k == 6)) for k in range(1, 7)]
+    records = [(k * 10**9, '/fls/image', picture) for k, picture in seen]
+    poses = [(k * 10**9 + 1, '/auv/odometry', pose_at(k * 10**9, 0.5 * k)) for k in range(1, 7)]
+    return marine.write_bag(tmp_path / 'survey', [*records, *poses])
 
 
 def test_images_become_pings_also_empty_ones_and_navigation_comes_along(bag, tmp_path, capsys):
@@ -308,11 +306,9 @@ def test_fields_are_found_by_the_names_that_are_told(tmp_path, capsys):
 
 def test_mistakes_of_the_user_are_one_sentence(tmp_path, capsys):
     bag = write(tmp_path / 'bag', {'/a': [ones(8)], '/p': [ones(8)]})
-    for arguments, word in (
-        (('--amplitude', '/a'), 'name the topics'),
-        ((), 'name the topics'),
-        (('--iq', '/a'), 'at least two staves'),
-        (('--iq', '/a', '--iq', '/nowhere'), "no topic '/nowhere'"),
-        (('--iq', '/a', '--iq', '/p', '--field', 'colour=x'), "unknown field 'colour'"),
-    ):
-        assert word in refused(capsys, 'interferometer', bag, tmp_path / 'out', *arguments)
+    for words, said in (
+        ('--amplitude /a', 'name the topics'), ('', 'name the topics'),
+        ('--iq /a', 'at least two staves'), ('--iq /a --iq /nowhere', "no topic '/nowhere'"),
+        ('--iq /a --iq /p --field colour=x', "unknown field 'colour'"),
+    ):  # fmt: skip
+        assert said in refused(capsys, 'interferometer', bag, tmp_path / 'out', *words.split())

@@ -11,7 +11,8 @@
 from datetime import datetime, timedelta, timezone
 import math
 
-from helpers.field_files import checked, measured, minutes
+from helpers.field_files import checked, measured, minutes, position
+from helpers.sonar_files import PLACE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -26,14 +27,6 @@ pyais = pytest.importorskip('pyais')
 pytest.importorskip('pynmea2')
 
 BEGIN = datetime(2024, 5, 31, 23, 59, 50, tzinfo=timezone.utc)
-PLACE = 54.0, 10.0
-
-
-def position(kind, moment, place=PLACE, talker='GP'):
-    where, clock = f'{minutes(place[0], 2)},N,{minutes(place[1], 3)},E', f'{moment:%H%M%S}.00'
-    if kind == 'GGA':
-        return checked(f'{talker}GGA,{clock},{where},4,08,0.9,2.0,M,40.0,M,,')
-    return checked(f'{talker}RMC,{clock},A,{where},1.0,45.0,{moment:%d%m%y},,')
 
 
 def heading(value):
@@ -109,9 +102,8 @@ def test_tracked_targets_are_placed_from_the_vessel_or_where_they_say(tmp_path):
 
 def test_times_before_a_sentence(tmp_path):
     report = ais(211_000_001, (54.01, 10.01), 60)
-    for k, before in enumerate(
-        ['1717199990.0 ', '2024-05-31T23:59:50Z,', '\\s:a,c:1717199990*5A\\', '1717199990000;']
-    ):
+    words = '1717199990.0 ', '2024-05-31T23:59:50Z,', '\\s:a,c:1717199990*5A\\', '1717199990000;'
+    for k, before in enumerate(words):
         assert of(converted(tmp_path, [before + report], f'{k}'))[0].stamp_ns == ns(BEGIN)
 
 
@@ -233,11 +225,10 @@ def test_the_date_is_advised_only_where_it_helps(tmp_path):
 def by_talkers(apart, first='GP'):
     """A log of two talkers, of which GN says more, `apart` m to the north."""
     lines, there = [], (PLACE[0] + apart / 111e3, PLACE[1])
-    for k in range(20):
-        moment = BEGIN + timedelta(seconds=k)
+    for moment in (BEGIN + timedelta(seconds=k) for k in range(20)):
         more = [position(kind, moment, there, 'GN') for kind in ('RMC', 'GGA')]
-        both = [[position('GGA', moment)], more]
-        lines += sum(both if first == 'GP' else both[::-1], [])
+        one = [position('GGA', moment)]
+        lines += one + more if first == 'GP' else more + one
     return lines
 
 

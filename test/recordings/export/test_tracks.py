@@ -373,13 +373,11 @@ def test_what_cannot_be_exported_is_one_sentence(tracked, capsys):
         for k in range(T):
             file.header[k].update({segyio.TraceField.HourOfDay: 5})
     for name, options, words in (
-        ('tracks.gpx', (), 'is for tracks'),
-        ('x.sgy', (), 'needs --segy'),
-        ('x.txt', (), 'ends in none of'),
+        ('tracks.gpx', (), 'is for tracks'), ('x.sgy', (), 'needs --segy'),
+        ('x.txt', (), 'ends in none of'), ('x.sgy', ('--segy', other), 'its times are others'),
         ('line.seg', ('--segy', tracked / 'line.seg', '--overwrite'), 'stays as it is'),
-        ('x.sgy', ('--segy', other), 'its times are others'),
         ('x.xyz', (), 'no soundings'),
-    ):
+    ):  # fmt: skip
         assert export(tracked, name, *options) == 2
         error = capsys.readouterr().err
         assert words in error and 'Traceback' not in error
@@ -390,11 +388,9 @@ def test_without_places_there_is_a_table_but_no_map(tracked, tmp_path, capsys):
     scene = ('simulate', 'fathometer', tmp_path / 'bag', '--scenario', 'diffuse')
     assert command(*scene, '--set', 'records=4') == 0
     assert command('track', tmp_path / 'bag', tmp_path / 'run') == export(tmp_path, 'h.csv') == 0
-    for name, options, words in (
-        ('h.geojson', (), 'no positions'),
-        ('m.csv', ('--epsg', 32615), 'no positions'),
-        ('p.sgy', ('--segy', tracked / 'line.seg'), 'does not say how it was made'),
-    ):
+    of_line = ('p.sgy', ('--segy', tracked / 'line.seg'), 'does not say how it was made')
+    of_map = ('m.csv', ('--epsg', 32615), 'no positions')
+    for name, options, words in (('h.geojson', (), 'no positions'), of_map, of_line):
         assert export(tmp_path, name, *options) == 2
         assert words in capsys.readouterr().err
 
