@@ -27,7 +27,6 @@ BAG = ROOT / 'bags' / 'diver_table1'
 
 
 def of_kind(kind):
-    """The names of one kind, each what stands behind the kind."""
     return sorted(key.removeprefix(f'{kind} ') for key in GONE if key.startswith(f'{kind} '))
 
 

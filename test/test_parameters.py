@@ -11,7 +11,7 @@
 import math
 
 import attrs
-from helpers.anchors import multiplying
+from helpers.refusals import multiplying
 from hypothesis import given
 from hypothesis import strategies as st
 import pytest
