@@ -118,7 +118,8 @@ test-system: venv ## run the tests that start real nodes, two at a time (SYSTEM_
 	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS) $(SHARED) test/system/test_tutorials.py test/system
 
 reliability: venv ## 40 minutes: all that may go wrong, and its page; goes on where it was broken off (SHARE=4 PARTS='soak flood' RELIABILITY=folder)
-	CASES=$(CASES) SONAR_IMM_SHARE=$(SHARE) $(TEST_ENV) $(BIN)/python -m benchmarks.reliability $(RELIABILITY) --run $(PARTS)
+	code=0; CASES=$(CASES) SONAR_IMM_SHARE=$(SHARE) $(TEST_ENV) $(BIN)/python -m benchmarks.reliability $(RELIABILITY) \
+	    --run $(PARTS) || code=$$?; $(BIN)/python docs/generate.py; exit $$code
 
 lint: venv ## check the style with ruff and the types with mypy
 	$(BIN)/ruff check .

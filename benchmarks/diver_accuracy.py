@@ -8,12 +8,21 @@
 
 """Accuracy of the whole diver tracker, with gating and track logic.
 
-    python -m benchmarks.diver_accuracy --runs 60 --out docs/results/diver_accuracy.json
     export SONAR_IMM_DATA=../shared/data
-    python -m benchmarks.diver_accuracy --parts paths --add --out FILE
+    python -m benchmarks.diver_accuracy --out docs/results/diver_accuracy.json
 
 `scenes` are those of the simulator; other programs on them are in `diver_paper`. RMSE is over all
 stamps from the first fix on.
+
+`identity`: whose track is whose, by two ways to pair fixes and divers on the same scans; nothing
+is configured. `buddies`: two divers swim legs the same way, 2 m apart, at .75 m/s for 120 s. A
+sonar sees them without names: a scan per second, .5 m on each axis, P_D .9, two false fixes in a
+square of 120 m. The transponder of the first is heard from the 20th second on, every four seconds,
+good to 2 m. `crossing`: two pairs that cross within a metre, a scan per second, .7 m on each axis,
+P_D .7, ten false fixes in a square of 160 m. `harbour`: eight boats on legs of 10 to 30 s at
+3 m/s, 2 m on each axis, a scan each 2 s, P_D .9, 20 false fixes in a square of 400 m. Counted are
+confirmed tracks: GOSPA (10 m, 2; of boats 20 m), `with switches` half of the cutoff for each
+identity switch; switches and false tracks for each hour.
 
 `paths`: 33 paths against every single family of motion, told the truth: boats, scooters, swimmers
 in legs, circles and zigzags, divers who stand, loiter or drift; three paths were recorded (an
@@ -31,11 +40,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.recordings import autoferry, DATA
-from benchmarks.study import final_estimates, first_track, Parts, rms, study, truths
-from sonar_imm.measurements import Fix
+from benchmarks.recordings import autoferry
+from benchmarks.study import DATA, final_estimates, first_track, Parts, rms, study, truths
+from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
-from sonar_imm.truth import TrueTrack
+from sonar_imm.truth import Scene, TrueTrack
+from sonar_imm_tools.evaluation.diver.scoring import score
+from sonar_imm_tools.evaluation.diver.series import series_of, Truth
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 SINGLES: dict[str, dict[str, Any]] = {
@@ -294,16 +306,15 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 # -- scenes of the simulator ----------------------------------------------------------------------
 
 
-def whole_tracker(runs: int, **values: Any) -> dict[str, dict[str, float]]:
-    """Gating, track logic and all, defaults but for `values`: RMSE of the confirmed track, scans
-    without one, identities."""
+def whole_tracker(runs: int) -> dict[str, dict[str, float]]:
+    """Gating, track logic and all: RMSE of the confirmed track, scans without one, identities."""
     table = {}
     for name in ('table1', 'irregular', 'multistatic', 'multistatic_fixes'):
         squared, absent, names, total = [], 0, [], 0
         for seed in range(runs):
             scene = simulate(scenario(name), seed)
             measurements = [item.measurement for item in scene.measurements]
-            tracker = DiverTracker(DiverConfig(max_tracks=1, **values))
+            tracker = DiverTracker(DiverConfig(max_tracks=1))
             final = final_estimates(tracker, measurements)
             path = truths(scene, TrueTrack)[0]
             at = {int(stamp): k for k, stamp in enumerate(path.stamp_ns)}
@@ -325,11 +336,128 @@ def whole_tracker(runs: int, **values: Any) -> dict[str, dict[str, float]]:
     return table
 
 
-def main(runs: int = 60, seeds: int = 2, parts: Sequence[str] = ('scenes',)) -> Parts:
-    """runs: of each scene; seeds: of each path."""
+# -- identities ------------------------------------------------------------------------------
+
+SCENES = ('buddies', 'crossing', 'harbour')
+CUTOFF = 10.0
+HALF, FALSE, SCAN_STD, NAMED_STD, P_DETECTION = 60.0, 2.0, 0.5, 2.0, 0.9
+NAMED_FROM, EVERY = 20, 4
+
+
+def true_paths(scene: Scene) -> Truth:
+    tables = [table for true in scene.truth for table in true.tables('map')]
+    rows = [
+        Estimate.from_columns(table.columns, stamp_ns=table.stamp_ns, frame_id='map')
+        for table in tables
+    ]
+    return Truth.from_series(series_of(rows))
+
+
+def buddies(seed: int) -> tuple[TrueTrack, TrueTrack]:
+    """The paths of two divers who swim the same way 2 m apart."""
+    values: dict[str, Any] = {
+        'duration': 120.0,
+        'speed': 0.75,
+        'start': [-20.0, 0.0],
+        'turn_deg': 60.0,
+    }
+    first = truths(simulate(scenario('table1', values), seed), TrueTrack)[0]
+    aside = first.position + [0.0, 2.0, *([0.0] * (first.position.shape[1] - 2))]
+    return first, TrueTrack(2, first.stamp_ns, aside, first.velocity)
+
+
+def measured(truth: tuple[TrueTrack, ...], seed: int) -> list[Fix | Fixes]:
+    """Scans without names, and fixes of the first diver with its name, in order."""
+    rng = np.random.default_rng([seed, 7])
+    measurements: list[Fix | Fixes] = []
+    for k, stamp in enumerate(truth[0].stamp_ns.tolist()):
+        there = np.array([path.position[k, :2] for path in truth])
+        there = there[rng.uniform(size=len(there)) < P_DETECTION]
+        seen = there + rng.normal(scale=SCAN_STD, size=there.shape)
+        false = rng.uniform(-HALF, HALF, (rng.poisson(FALSE), 2))
+        both = np.concatenate([seen, false])
+        measurements.append(
+            Fixes(
+                stamp_ns=stamp,
+                position=np.column_stack([both, np.zeros(len(both))]),
+                covariance=np.tile(np.eye(2) * SCAN_STD**2, (len(both), 1, 1)),
+                frame_id='map',
+            )
+        )
+        if k < NAMED_FROM or (k - NAMED_FROM) % EVERY:
+            continue
+        place = truth[0].position[k, :2] + rng.normal(scale=NAMED_STD, size=2)
+        measurements.append(
+            Fix(
+                stamp_ns=stamp + 300_000_000,
+                position=[*place, 0.0],
+                covariance=np.eye(2) * NAMED_STD**2,
+                target_id=truth[0].track_id,
+                frame_id='map',
+            )
+        )
+    return measurements
+
+
+def identity_scene(name: str, seed: int) -> tuple[list[Any], Scene, float]:
+    """The measurements, the truth, and the cutoff of GOSPA in m."""
+    if name == 'buddies':
+        truth = buddies(seed)
+        return list(measured(truth, seed)), Scene((), truth), CUTOFF
+    if name == 'crossing':
+        scene = simulate(
+            scenario('crossing', {'detection_probability': 0.7, 'clutter': 10.0}), seed
+        )
+        return [item.measurement for item in scene.measurements], scene, CUTOFF
+    values = {
+        'motion': 'legs',
+        'sensor': 'scans',
+        'start': [0.0, 0.0],
+        'detection_probability': 0.9,
+        'divers': 8,
+        'speed': 3.0,
+        'turn_deg': 180.0,
+        'leg_min': 10.0,
+        'leg_max': 30.0,
+        'duration': 300.0,
+        'step': 2.0,
+        'spacing': 30.0,
+        'fix_std': 2.0,
+        'clutter': 20.0,
+        'clutter_range': 200.0,
+    }
+    scene = simulate(scenario('table1', values), seed)
+    return [item.measurement for item in scene.measurements], scene, 20.0
+
+
+def identities(name: str, runs: int, **settings: Any) -> dict[str, float]:
+    """The scores of a way to pair, over all runs of a scene."""
+    scored: list[dict[str, Any]] = []
+    for seed in range(runs):
+        items, scene, cutoff = identity_scene(name, seed)
+        tracker = DiverTracker(DiverConfig(**settings))
+        series = series_of([tracker.process(item)[-1] for item in items])
+        scored.append(score(series, true_paths(scene), cutoff=cutoff))
+    tracks = [each['tracks'] for each in scored]
+    hours = sum(each['span_s'] for each in scored) / 3600.0
+    return {
+        'switches/h': sum(each['identity_switches'] for each in tracks) / hours,
+        'GOSPA, rms': rms([each['gospa']['rms_m'] for each in scored]),
+        'with switches': float(np.mean([each['gospa']['with_switches_m'] for each in scored])),
+        'completeness': float(np.mean([each['completeness'] for each in tracks])),
+        'RMSE': rms([each['position']['rmse_m'] for each in scored]),
+        'NEES': float(np.mean([each['consistency']['nees_position']['mean'] for each in scored])),
+        'false tracks/h': sum(each['false_tracks'] for each in tracks) / hours,
+    }
+
+
+PARTS = ('scenes', 'paths', 'identity')
+
+
+def main(runs: int = 60, seeds: int = 2, scans: int = 10, parts: Sequence[str] = PARTS) -> Parts:
+    """runs: of each scene; seeds: of each path; scans: runs of scenes of several targets."""
     if 'scenes' in parts:
         yield {'runs': runs}
-        yield {'the whole tracker': whole_tracker(runs, model_set='heading_speed')}
         yield {'the whole tracker, by default': whole_tracker(runs)}
     if 'paths' in parts:
         rows = []
@@ -337,7 +465,12 @@ def main(runs: int = 60, seeds: int = 2, parts: Sequence[str] = ('scenes',)) -> 
             rows.append(scores(path))
             yield {'paths': {name: rows[-1]}}
         yield {'summary': summary(rows)}
+    for name in SCENES if 'identity' in parts else ():
+        for association in ('gnn', 'jipda'):
+            count = min(scans, 3) if name == 'harbour' else scans
+            row = identities(name, count, association=association)
+            yield {'identity': {f'{name}, {association}': {'runs': count, **row}}}
 
 
 if __name__ == '__main__':
-    study(main, parts={'choices': ('scenes', 'paths')})
+    study(main, parts={'choices': PARTS})

@@ -17,7 +17,6 @@ nearest, at most 5 m off; `lost` counts the runs without one. P is the mean prob
 behaviour at 30 m, v the RMSE of the velocity of each axis there.
 `velocity` is the RMSE of the velocity of each axis at times after an obstacle is seen first or,
 while it is followed, begins to move or stops, of those in the beam.
-Forecasts of collisions: `benchmarks.obstacle_calibration`.
 """
 
 from __future__ import annotations
@@ -29,8 +28,9 @@ import numpy as np
 
 from benchmarks.obstacle_accuracy import (
     config_of,
+    first_at,
+    followed,
     LEVER,
-    nearest,
     offset_at,
     RANGES,
     summary,
@@ -52,16 +52,13 @@ FLOOR = {'altitude': 6.0}
 its recordings; its table does not say."""
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     'fixed': ('approach', {}),
-    'fixed, roll 4 deg': ('rolling', {}),
     'swaying': ('swaying', {}),
     'swaying, roll 4 deg': ('swaying', {'roll_rms_deg': 4.0}),
-    'swaying, roll 4 deg, shallow': ('swaying', {'roll_rms_deg': 4.0, **FLOOR}),
     'swaying, calm': ('swaying', CALM),
     'smooth sway': ('swaying', {'obstacle_motion': 'swinging'}),
     'moving .3-1.5 m/s': ('mover', {}),
     'moving .1-.3 m/s': ('mover', {'obstacle_speed': [0.1, 0.3]}),
     'on the sea floor': ('approach', {**FLOOR, 'vertical_offset': 5.7, 'offset_spread': 0.5}),
-    'half a metre above the sea floor': ('approach', {**FLOOR, 'placement': 'seabed'}),
 }
 VELOCITY: dict[str, tuple[dict[str, Any], float, tuple[float, ...]]] = {
     'moves': ({}, 0.0, (5.0, 10.0, 20.0)),
@@ -75,27 +72,6 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 AT = 30.0
 EVERY = (*CASES, 'velocity')
-
-
-def followed(
-    truth: TrueObstacle, final: dict[int, Estimate], ping: int
-) -> dict[str, float] | None:
-    """The columns of the confirmed track nearest to an obstacle at a ping, None without one."""
-    estimate = final.get(int(truth.stamp_ns[ping]))
-    if estimate is None or (row := nearest(truth, estimate, ping)) is None:
-        return None
-    return {name: float(values[row]) for name, values in estimate.extras.items()}
-
-
-def first_at(
-    truth: TrueObstacle, final: dict[int, Estimate], at: float
-) -> tuple[int, dict[str, float]] | None:
-    """The ping at which the range first falls to `at` and the obstacle is followed."""
-    for ping in np.flatnonzero(truth.range <= at)[:6].tolist():
-        found = followed(truth, final, ping)
-        if found is not None:
-            return ping, found
-    return None
 
 
 def off_velocity(truth: TrueObstacle, ping: int, found: dict[str, float]) -> list[float]:

@@ -8,8 +8,6 @@
 
 """The obstacle tracker on the real motion of a vehicle, with simulated detections: semi-synthetic.
 
-    python -m benchmarks.real_navigation
-
 There is no public recording of forward-looking sonar detections with navigation. This takes 20
 minutes of an AUV's attitude (10 Hz) and Doppler log (1.5 Hz) in a marina, dead-reckons the path,
 takes that path as the truth, and lets a simulated sonar look at simulated obstacles from it. So
@@ -27,7 +25,6 @@ answering the mean of all true offsets, which nobody knows beforehand.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from attrs import frozen
@@ -35,24 +32,19 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from benchmarks.study import Parts, rms, study
+from benchmarks.study import DATA, rms
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
+FOLDER = DATA / 'stpere_nav'
 SECOND = 10**9
 DEPTH = 2.0
 WINDOW = 80.0
 """Seconds of one encounter."""
 PING_STEP = 0.5
 STD = (0.15, np.radians(0.25))
-
-
-def data_folder() -> Path:
-    """Where the recording lies: below SONAR_IMM_DATA, by default ../shared/data."""
-    root = Path(__file__).resolve().parents[1]
-    return Path(os.environ.get('SONAR_IMM_DATA', root / '../shared/data')) / 'stpere_nav'
 
 
 @frozen(eq=False)
@@ -70,7 +62,7 @@ class Path3D:
         return Pose(place, Slerp(self.t, self.attitude)(t).as_matrix())
 
 
-def dead_reckoned(folder: Path) -> Path3D:
+def dead_reckoned(folder: Path = FOLDER) -> Path3D:
     """The path from attitude and bottom velocity (smoothed over 6 s)."""
     attitude = np.genfromtxt(folder / 'attitude.csv', delimiter=',', names=True)
     log = np.genfromtxt(folder / 'dvl.csv', delimiter=',', names=True)
@@ -205,16 +197,10 @@ def summary(path: Path3D, runs: int = 40, altimeter: bool = True) -> dict[str, f
     }
 
 
-def main(runs: int = 100) -> Parts:
-    path = dead_reckoned(data_folder())
-    roll = np.degrees(path.attitude.as_euler('ZYX')[:, 2])
-    print(
-        f'{path.t[-1] - path.t[0]:.0f} s, roll {roll.std():.2f} deg rms, travelled '
-        f'{np.linalg.norm(np.diff(path.position, axis=0), axis=1).sum():.0f} m'
-    )
-    yield {'between surface and sea floor': summary(path, runs)}
-    yield {'within 1.2 m, altitude untold': summary(path, runs, altimeter=False)}
-
-
-if __name__ == '__main__':
-    study(main, digits=2)
+def rows(runs: int = 100) -> dict[str, dict[str, float]]:
+    """Numbers where the altitude is known, and where it is not."""
+    path = dead_reckoned()
+    return {
+        'between surface and sea floor': summary(path, runs),
+        'within 1.2 m, altitude untold': summary(path, runs, altimeter=False),
+    }

@@ -6,38 +6,33 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What was tried to break the package, in one run, one file and the tables of docs/reliability.md.
+"""What was tried to break the package, in one run and one file.
 
     python -m benchmarks.reliability FOLDER --run             every part that is not done
     python -m benchmarks.reliability FOLDER --run soak flood  these parts only
-    python -m benchmarks.reliability FOLDER    file and page of the parts in FOLDER
-    python -m benchmarks.reliability           writes the tables of the page anew
-    python -m benchmarks.reliability --check   whether the page says what the file says
+    python -m benchmarks.reliability FOLDER                   the file of the parts in FOLDER
 
 A part is a JSON file in FOLDER that a program writes row by row (`PROGRAMS`). What was broken off
 goes on: rows that are there and good are not measured again, those that fell short are. To measure
-all anew, take another folder. File and page are of one folder and are written when all of its
-parts are there; how long each part took, and of which commit it is, lies beside them. Ends with 1
-when something fell short.
+all anew, take another folder. The file is of one folder and is written when all of its parts are
+there; how long each part took, and of which commit it is, lies beside them. Ends with 1 when
+something fell short.
 
 ``SONAR_IMM_SHARE`` is how much is tried: 1 takes 40 minutes on a quiet machine of two cores, 4 is
 four times as many signals, kills, hours at sea and damaged files. Less than 1 only shows that all
-programs run, each fault on one node: file and page are written into FOLDER then.
+programs run, each fault on one node: the file is written into FOLDER then.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from datetime import date
 import json
-from operator import itemgetter
 import os
 from pathlib import Path
-import re
 import subprocess
 import sys
-import textwrap
 import time
 from typing import Any
 
@@ -47,7 +42,6 @@ from sonar_imm.trackers import SYSTEMS
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / 'docs' / 'results' / 'reliability.json'
-PAGE = ROOT / 'docs' / 'reliability.md'
 CASES = os.environ.get('CASES', '100000')
 """Hostile messages for each system."""
 SHARE = float(os.environ.get('SONAR_IMM_SHARE', '1.0'))
@@ -76,125 +70,13 @@ SLOWER = 2.0
 """Times by which the 99th percentile of the last tenth may be above that of the first."""
 LONGEST = 30.0
 """CPU seconds that one message may take."""
-_BLOCK = re.compile(r'(<!-- reliability: (\w+) -->\n).*?(<!-- /reliability -->)', re.DOTALL)
-
 Part = Any
 """Rows as a list, or by system (of 'bounds': by kind of message)."""
 Row = Mapping[str, Any]
 
 
-def _plain(name: str, form: str = '') -> Callable[[Row], str]:
-    return lambda row: format(row[name], form)
-
-
 def _failures(row: Row) -> int:
     return len(row['messages']['failures']) + len(row['parameters']['failures'])
-
-
-SOAK: dict[str, Callable[[Row], str]] = {
-    'system': _plain('system'),
-    'hours': _plain('hours', 'g'),
-    'memory, MB': _plain('memory_mb', '.0f'),
-    'slope, MB/h': _plain('slope_mb_per_h', '.3f'),
-    'grown in the second half, MB': _plain('grown_mb', '.2f'),
-    'p99 first tenth, ms': _plain('p99_first_ms', '.2f'),
-    'p99 last tenth, ms': _plain('p99_last_ms', '.2f'),
-}
-MESSAGES = {
-    'fixes': '`fixes`: 10,000 of one scan, at random, `association: gnn`',
-    'fixes_softly': 'the same by default',
-    'arrivals_wild_tag': '`arrivals`: a tag, 1000 receivers, times that fit nothing',
-    'arrivals_many_divers': '`arrivals`: echoes of 50 divers at 20 receivers',
-    'detections': '`detections`: 10,000 echoes all over the beam',
-    'snapshot': '`snapshot`: 20,000 bins of 8 staves',
-    'pressure': '`pressure`: 200,000 samples of 32 hydrophones',
-    'csdm': '`csdm`: 2000 frequencies of 32 hydrophones',
-    'trace': '`trace`: 50,000 depths',
-}
-"""What the messages of `benchmarks.bounds` are."""
-COLUMNS: dict[str, dict[str, Callable[[Row], str]]] = {
-    'bounds': {
-        'message': lambda row: MESSAGES[row['system']],
-        'MB': _plain('size_mb', '.2f'),
-        'CPU s': _plain('cpu_s', '.2f'),
-        'memory MB': _plain('memory_mb', '.0f'),
-    },
-    'flood': {
-        'node': _plain('system'),
-        'can, 1/s': _plain('capacity', '.0f'),
-        'sent, 1/s': _plain('rate', '.0f'),
-        'used': _plain('used'),
-        'dropped': _plain('dropped'),
-        'lost': _plain('lost'),
-        'latency p50, s': _plain('latency_p50', '.2f'),
-        'most, s': _plain('latency_max', '.2f'),
-        'recovery, s': _plain('recovered', '.2f'),
-    },
-    'soak': SOAK,
-    'soak_live': SOAK,
-}
-"""The columns of each table with a row for each row of the part; that of the faults has one for
-each fault and a column for each system (`table_of`)."""
-
-
-def _signals(rows: Sequence[Row]) -> str:
-    names = ', '.join(dict.fromkeys(row['signal'] for row in rows))
-    clean, tried = (sum(row[name] for row in rows) for name in ('clean', 'tried'))
-    return f'{clean} of {tried} nodes ended so: {names}.'
-
-
-def _restart(rows: Sequence[Row]) -> str:
-    killed, estimates, equal, changed = (
-        sum(row[name] for row in rows)
-        for name in ('tried', 'estimates', 'equal', 'changed_without')
-    )
-    return (
-        f'{killed} nodes killed: {equal} of {estimates} estimates are equal bit for bit; without '
-        f'the file {changed} differ.'
-    )
-
-
-def _damage(rows: Sequence[Row]) -> str:
-    each = ', '.join(f'{row["what"]} {row["tried"]} times' for row in rows)
-    tried, said, silent, failed = (
-        sum(int(row[name]) for row in rows) for name in ('tried', 'said', 'silent', 'failed')
-    )
-    return (
-        f'{each}: {said} of {tried} reported, {silent} silent and not harmless, {failed} crashes '
-        'or partial outputs.'
-    )
-
-
-def _hostile(rows: Sequence[Row]) -> str:
-    sent, read = (sum(row['messages'][name] for row in rows) for name in ('cases', 'read'))
-    draws, slowest = (
-        sum(row['parameters']['draws'] for row in rows),
-        max(row['messages']['ms_p999'] for row in rows),
-    )
-    crashes = sum(map(_failures, rows))
-    return (
-        f'{sent} messages, of which {read} could be read, and {draws} extreme parameters: '
-        f'{crashes} crashes; the slowest of 1000 messages took {slowest:g} ms.'
-    )
-
-
-def _metamorphic(rows: Sequence[Row]) -> str:
-    shares = [row['states'] / (row['tolerance'] or 1.0) for row in rows]
-    row, share = max(zip(rows, shares), key=itemgetter(1))
-    return (
-        f'{len(rows)} pairs of a way to track and a moved scene: states differ by at most '
-        f'{share:.1g} of what is tolerated ({row["system"]}, {row["how"]}, {row["moved"]}).'
-    )
-
-
-SENTENCES: dict[str, Callable[[Sequence[Row]], str]] = {
-    'signals': _signals,
-    'restart': _restart,
-    'damage': _damage,
-    'hostile': _hostile,
-    'metamorphic': _metamorphic,
-}
-"""Parts that are a sentence on the page."""
 
 
 def rows_of(part: Part) -> list[Row]:
@@ -202,29 +84,6 @@ def rows_of(part: Part) -> list[Row]:
     if isinstance(part, Mapping):
         return [{'system': system, **row} for system, row in part.items()]
     return list(part)
-
-
-def table_of(name: str, part: Part) -> list[list[str]]:
-    """Return the cells of the table of a part, the head first."""
-    rows = rows_of(part)
-    if name == 'faults':
-        cells = {(row['system'], row['fault']): _recovery(row) for row in rows}
-        alike: dict[tuple[str, ...], list[str]] = {}
-        for fault in dict.fromkeys(row['fault'] for row in rows):
-            of_fault = tuple(cells.get((system, fault), '') for system in SYSTEMS)
-            alike.setdefault(of_fault, []).append(fault)
-        return [['fault', *SYSTEMS], *(['; '.join(names), *each] for each, names in alike.items())]
-    columns = COLUMNS[name]
-    return [[*columns], *([text(row) for text in columns.values()] for row in rows)]
-
-
-def _recovery(row: Row) -> str:
-    """Messages until estimates are as if nothing had been, and what was lost."""
-    recovered = 'never' if row['recovered'] is None else str(row['recovered'])
-    losses = ', '.join(
-        f'{n} {name.rpartition(": ")[2]}' for name, n in sorted(row['losses'].items())
-    )
-    return f'{recovered}; {losses}' if losses else recovered
 
 
 def short_of(parts: Mapping[str, Part]) -> list[str]:
@@ -336,55 +195,11 @@ def _part(file: Path) -> Any:
     return part
 
 
-def _about(run: Mapping[str, Row]) -> str:
-    """Return the run in a sentence."""
-    seconds = sum(of['seconds'] for of in run.values())
-    (last, *_) = sorted((of['date'] for of in run.values()), reverse=True)
-    processors = max(of['processors'] for of in run.values())
-    commits = sorted({commit for of in run.values() for commit in of['commits']})
-    shares = sorted({of['share'] for of in run.values()})
-    return (
-        f'One run of {last}, {seconds / 60.0:.0f} minutes on {processors} '
-        f'processors, of {" and ".join(f"`{commit}`" for commit in commits)}, `SHARE` '
-        f'{" and ".join(f"{share:g}" for share in shares)}.'
-    )
-
-
-def page_of(text: str, parts: Mapping[str, Part]) -> str:
-    """The page with the tables of `parts` between its marks."""
-
-    def table(found: re.Match[str]) -> str:
-        name = found.group(2)
-        if name not in parts and name == 'run':
-            return f'{found.group(1)}Measured part by part, of several versions.\n{found.group(3)}'
-        if name not in parts:
-            return f'{found.group(1)}Not measured yet.\n{found.group(3)}'
-        if name == 'run':
-            return f'{found.group(1)}{_about(parts[name])}\n{found.group(3)}'
-        if name in SENTENCES:
-            sentence = textwrap.fill(SENTENCES[name](rows_of(parts[name])), 140)
-            return f'{found.group(1)}{sentence}\n{found.group(3)}'
-        head, *body = table_of(name, parts[name])
-        lines = [head, ['---'] * len(head), *body]
-        text = '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
-        return f'{found.group(1)}{text}\n{found.group(3)}'
-
-    return _BLOCK.sub(table, text)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('folder', type=Path, nargs='?')
-    parser.add_argument('--check', action='store_true')
+    parser.add_argument('folder', type=Path)
     parser.add_argument('--run', nargs='*', choices=PARTS, metavar='PART')
     given = parser.parse_args()
-    parts = known(RESULT)
-    page = PAGE.read_text(encoding='utf-8')
-    if given.check:
-        sys.exit(page != page_of(page, parts))
-    if given.folder is None:
-        PAGE.write_text(page_of(page, parts), encoding='utf-8')
-        return
     folder = given.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     for name in () if given.run is None else given.run or PARTS:
@@ -394,8 +209,6 @@ def main() -> None:
         whole = all(of['share'] >= 1.0 for of in parts.get('run', {}).values())
         result = RESULT if whole else folder / RESULT.name
         write_json(result, parts, command='make reliability')
-        written = PAGE if whole else folder / PAGE.name
-        written.write_text(page_of(page, parts), encoding='utf-8')
     problems = short_of(parts)
     print('\n'.join(problems) or 'all promises kept')
     sys.exit(bool(problems))

@@ -50,6 +50,8 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.truth import Scene
 
 ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get('SONAR_IMM_DATA', ROOT / '../shared/data'))
+"""Where the recordings of others lie."""
 ENTRY = str(ROOT / 'benchmarks' / 'entry')
 """Where the models of `diver_paper` are registered, as those of an installed package are."""
 if ENTRY not in sys.path:

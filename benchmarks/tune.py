@@ -18,12 +18,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 import tempfile
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.recordings import DATA
-from benchmarks.study import Parts, study
+from benchmarks.study import DATA, Parts, study
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.tracker import DiverConfig
 from sonar_imm_tools.cli import main as sonar_imm
@@ -31,32 +30,32 @@ from sonar_imm_tools.cli.track import Plan
 from sonar_imm_tools.evaluation.tuning import prepared, tune, Tuned
 from sonar_imm_tools.recordings.convert import convert_fixes
 
-ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
-    'diver, covariances 4 times too small': (
-        'diver',
-        'random_heading',
-        {'duration': '300'},
-        {'covariance_scale': '0.25', 'model_set': 'heading_speed'},
-        'covariance_scale',
-        1.0,
+Settings = dict[str, str]
+
+
+class Case(NamedTuple):
+    """System, scene, its settings, parameters to begin with, what is fitted, and what is true:
+    None where the scene has no such number; scenes of `MADE` are no scenarios."""
+
+    system: str
+    scene: str
+    settings: Settings
+    begin: Settings
+    fitted: str = 'covariance_scale'
+    true: Any = 1.0
+
+
+HEADINGS = {'model_set': 'heading_speed'}
+SMALL = {'covariance_scale': '0.25', **HEADINGS}
+ROWS: dict[str, Case] = {
+    'diver, covariances 4 times too small': Case(
+        'diver', 'random_heading', {'duration': '300'}, SMALL
     ),
-    'diver, covariances as stated': (
-        'diver',
-        'random_heading',
-        {'duration': '300'},
-        {'model_set': 'heading_speed'},
-        'covariance_scale',
-        1.0,
+    'diver, covariances as stated': Case('diver', 'random_heading', {'duration': '300'}, HEADINGS),
+    'diver who moves as the model says, covariances 4 times too small': Case(
+        'diver', 'as modelled', {'fixes': '300'}, SMALL
     ),
-    'diver who moves as the model says, covariances 4 times too small': (
-        'diver',
-        'as modelled',
-        {'fixes': '300'},
-        {'covariance_scale': '0.25', 'model_set': 'heading_speed'},
-        'covariance_scale',
-        1.0,
-    ),
-    'diver, velocities that wander by 0.1, covariances 6 times too small': (
+    'diver, velocities that wander by 0.1, covariances 6 times too small': Case(
         'diver',
         'wandering',
         {'fixes': '400', 'noise': '0.1'},
@@ -65,25 +64,15 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
         (1.0, 0.1),
     ),
     **{
-        f'diver who moves as the model says, covariances {factor} times too small': (
-            'diver',
-            'as modelled',
-            {'fixes': '100', 'factor': str(factor)},
-            {},
-            'covariance_scale',
-            factor,
+        f'diver who moves as the model says, covariances {factor} times too small': Case(
+            'diver', 'as modelled', {'fixes': '100', 'factor': str(factor)}, {}, true=factor
         )
         for factor in (25, 60, 1000)
     },
-    'tow tag, a fix in 29 s': (
-        'diver',
-        'tow tag',
-        {},
-        {'max_coast': '600', 'target_z': '-1', 'model_set': 'heading_speed'},
-        'covariance_scale',
-        None,
+    'tow tag, a fix in 29 s': Case(
+        'diver', 'tow tag', {}, {'max_coast': '600', 'target_z': '-1', **HEADINGS}, true=None
     ),
-    'obstacle, ranges 3 times as noisy': (
+    'obstacle, ranges 3 times as noisy': Case(
         'obstacle',
         'approach',
         {'range_std': '0.45', 'first_range': '60'},
@@ -91,7 +80,7 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
         'range_std',
         0.45,
     ),
-    'fathometer, walk taken for 0.4 m': (
+    'fathometer, walk taken for 0.4 m': Case(
         'fathometer',
         'drift_traces',
         {'records': '60'},
@@ -99,7 +88,7 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
         'depth_std',
         None,
     ),
-    'bathymetry, rough patch': (
+    'bathymetry, rough patch': Case(
         'bathymetry',
         'paper',
         {'pings': '2', 'patch_std': '0.5'},
@@ -108,11 +97,9 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
         None,
     ),
 }
-"""System, scene, its settings, parameters to begin with, what is fitted, and what is true:
-None where the scene has no such number; scenes of `MADE` are no scenarios. Reflectors of the drift
-move by .01 m from record to record, by the tilt of the array and by .03 m of its depth; the
-heights of the rough patch are white, with a standard deviation of .5 m, and the floor beside it is
-flat."""
+"""Reflectors of the drift move by .01 m from record to record, by the tilt of the array and by
+.03 m of its depth; the heights of the rough patch are white, with a standard deviation of .5 m,
+and the floor beside it is flat."""
 
 
 ONCE = ('tow tag, a fix in 29 s',)
@@ -188,7 +175,7 @@ def main(runs: int = 3, rows: Sequence[str] = tuple(ROWS)) -> Parts:
     for name in rows:
         seeds = range(1, 1 + (1 if name in ONCE else runs))
         found = [fitted(name, seed) for seed in seeds]
-        truth = ROWS[name][-1]
+        truth = ROWS[name].true
         true = truth if isinstance(truth, tuple) else [truth] * len(found[0].parameters)
         for place, value in enumerate(true):
             each = [one.parameters[place] for one in found]

@@ -13,7 +13,7 @@ obstacle_fig3.png     the paper's Figure 3, with its altitude
 obstacle_fig4.png     Figure 4: the diagram of the large obstacle and its image
 obstacle_fig5.png     Figure 5 from our scenes; the distributions are those of
                       docs/results/obstacle_paper.json (benchmarks.obstacle_paper)
-obstacle_calibration.png   stated against happened collisions (benchmarks.obstacle_calibration)
+obstacle_calibration.png   stated against happened collisions (benchmarks.obstacle_accuracy)
 
 Needs matplotlib, which nothing else here does. Run it from the project root.
 """
@@ -56,7 +56,7 @@ from sonar_imm_tools.simulation.obstacle.simulator import (  # noqa: E402
 )
 
 OUT = ROOT / 'docs' / 'images'
-CALIBRATION = ROOT / 'docs' / 'results' / 'obstacle_calibration.json'
+CALIBRATION = ROOT / 'docs' / 'results' / 'obstacle_accuracy.json'
 PAPER = ROOT / 'docs' / 'results' / 'obstacle_paper.json'
 BLUE, RED, GREEN, INK = '#0072B2', '#D55E00', '#009E73', '#1b2733'
 COLOURS = (BLUE, RED, '#CC79A7', '#E69F00', GREEN, '#56B4E9')

@@ -8,8 +8,9 @@
 
 """Write the pages with measured numbers from their templates and the files of results.
 
-Whole pages: ``docs/templates/NAME.md.j2`` makes ``docs/results/NAME.md``. Single tables in pages
-written by hand: ``docs/templates/tables/NAME.md.j2`` replaces the table with the same head.
+Whole pages: ``docs/templates/NAME.md.j2`` makes ``docs/results/NAME.md``. Single
+tables in pages written by hand: ``docs/templates/tables/NAME.md.j2`` replaces the table with the
+same head.
 Templates take numbers by path, names joined by `>`: the first is the file below docs/results, the
 others lead to the number, as in ``diver_accuracy>paths>legs, 1 m, 1>raw``.
 """
@@ -25,6 +26,8 @@ from typing import Any
 
 import jinja2
 
+from sonar_imm.trackers import SYSTEMS
+
 ROOT = Path(__file__).resolve().parents[1]
 TEMPLATES = ROOT / 'docs' / 'templates'
 RESULTS = ROOT / 'docs' / 'results'
@@ -34,6 +37,9 @@ TABLES = {
     'fathometer': 'docs/fathometer.md',
 }
 """By template of `docs/templates/tables`: the page whose table it writes."""
+
+PAGES = {'reliability.md.j2': 'docs/reliability.md'}
+"""By template: the page, where that is no page of results."""
 
 NUMBER = re.compile(r'\{([^{}|]+)(?:\|([^{}]*))?\}')
 """A number in a cell: `{name}` or `{name|format}`."""
@@ -154,7 +160,8 @@ def rendered(template: Path, folder: Path = RESULTS) -> str:
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     numbers = Numbers(folder)
-    functions = {name: getattr(numbers, name) for name in ('n', 'table', 'made', 'sources')}
+    functions = {name: getattr(numbers, name) for name in ('at', 'n', 'table', 'made', 'sources')}
+    functions['systems'] = list(SYSTEMS)
     text = environment.from_string(template.read_text(encoding='utf-8')).render(functions)
     return text.rstrip() + '\n'
 
@@ -176,7 +183,7 @@ def with_table(page: str, table: str) -> str:
 def pages() -> dict[str, str]:
     """Return every page with measured numbers: its text by its path below the project root."""
     found = {
-        f'docs/results/{path.name.removesuffix(".j2")}': rendered(path)
+        PAGES.get(path.name, f'docs/results/{path.name}').removesuffix('.j2'): rendered(path)
         for path in sorted(TEMPLATES.glob('*.md.j2'))
     }
     for name, page in TABLES.items():

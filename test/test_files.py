@@ -209,24 +209,15 @@ def test_installed_files_lie_in_share_of_the_prefix(tmp_path, place):
     assert share_folder(module) == tmp_path / 'share' / 'sonar_imm'
 
 
-def test_source_tree_is_its_own_share(tmp_path):
-    module = touch(tmp_path / 'ws' / 'src' / 'sonar_imm' / 'sonar_imm' / 'resources.py')
-    root = module.parents[1]
+def test_a_source_tree_is_its_own_share_also_behind_the_links_of_a_symlink_install(tmp_path):
+    root, link = tmp_path / 'ws' / 'src' / 'sonar_imm', tmp_path / 'build'
+    module = touch(root / 'sonar_imm' / 'resources.py')
     touch(root / 'setup.py')
     touch(root / 'resource' / 'sonar_imm')
     # An older version installed above the workspace does not matter.
     touch(tmp_path / 'share' / 'sonar_imm' / 'package.xml')
-    assert share_folder(module) == root
-
-
-def test_links_of_a_symlink_install_lead_to_the_source(tmp_path):
-    module = touch(tmp_path / 'src' / 'sonar_imm' / 'resources.py')
-    touch(tmp_path / 'src' / 'setup.py')
-    touch(tmp_path / 'src' / 'resource' / 'sonar_imm')
-    link = tmp_path / 'build' / 'sonar_imm'
-    link.parent.mkdir()
     link.symlink_to(module.parent, target_is_directory=True)
-    assert share_folder(link / 'resources.py') == tmp_path / 'src'
+    assert share_folder(module) == share_folder(link / 'resources.py') == root
 
 
 def test_a_shared_file_is_found_and_what_is_missing_is_named(tmp_path):

@@ -27,7 +27,6 @@ BAG = ROOT / 'bags' / 'diver_table1'
 
 
 def of_kind(kind):
-    """The names of one kind, each what stands behind the kind."""
     return sorted(key.removeprefix(f'{kind} ') for key in GONE if key.startswith(f'{kind} '))
 
 
@@ -46,18 +45,13 @@ def known_parameters(system):
     return {spec.name for spec in specs}
 
 
-def test_every_key_is_of_a_kind_that_is_asked():
+def test_commands_kinds_of_conversion_and_options(capsys):
     kinds = {key.partition(' ')[0] for key in GONE}
     assert kinds == {'command', 'kind', 'parameter', 'choice', 'executable', 'option'}
-
-
-def test_commands_kinds_of_conversion_and_options(capsys):
-    for name in of_kind('command'):
-        assert name not in COMMANDS
-        assert f"'{name}' {GONE[f'command {name}']}" in answer(capsys, name, 'a', 'b')
-    for name in of_kind('kind'):
-        assert name not in OPTIONS
-        assert f"'{name}' {GONE[f'kind {name}']}" in answer(capsys, 'convert', name, 'a', 'b')
+    for kind, known, words in (('command', COMMANDS, []), ('kind', OPTIONS, ['convert'])):
+        for name in of_kind(kind):
+            assert name not in known
+            assert f"'{name}' {GONE[f'{kind} {name}']}" in answer(capsys, *words, name, 'a', 'b')
     for name in of_kind('option'):
         command, option = name.split()
         said = answer(capsys, command, 'out', f'{option}=1')

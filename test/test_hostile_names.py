@@ -126,9 +126,7 @@ def test_figures_have_no_links_nor_pictures_but_line_breaks():
     assert parts['layout']['title']['text'].startswith('&lt;/script>&lt;script>')
     assert not re.search('<(?:a|img|i onclick|/?script)', text)
     assert is_harmless(text)
-
-
-def test_a_figure_of_numbers_stays_as_it_is():
+    # One of numbers stays as it is.
     figure = go.Figure(layout={'title': 'depth [m]'})
     figure.add_scattergl(
         x=np.arange(3.0), y=[1, 2, 3], name='a & b', hovertemplate='%{x}<extra></extra>'

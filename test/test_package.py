@@ -23,7 +23,12 @@ import pytest
 import yaml
 
 import msg_adapters
+from msg_adapters.inputs import inputs_of
 import sonar_imm
+from sonar_imm.node_config import node_config_type, NodeConfig
+from sonar_imm.parameters import parameters_from_yaml
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.cli import COMMANDS
 
 if not (ROOT / 'setup.py').is_file():
     pytest.skip('these tests read the source tree', allow_module_level=True)
@@ -191,10 +196,6 @@ def test_generated_files_are_up_to_date():
 
 def test_every_system_is_found_by_its_name():
     """The record of a system names modules; each has to be there with what it is to provide."""
-    from msg_adapters.inputs import inputs_of
-    from sonar_imm.node_config import node_config_type, NodeConfig
-    from sonar_imm.trackers import SYSTEMS
-
     for name, system in SYSTEMS.items():
         assert name == system.name and inputs_of(name)
         assert issubclass(node_config_type(system), NodeConfig)
@@ -209,13 +210,9 @@ def test_every_system_is_found_by_its_name():
 
 def test_every_folder_of_a_system_is_listed_and_built():
     """A folder that `SYSTEMS` does not know would never be used; setup.py goes by the folders."""
-    from sonar_imm.trackers import SYSTEMS
-
+    rooms = 'sonar_imm/trackers', 'sonar_imm_tools/simulation', 'sonar_imm_tools/evaluation'
     folders = {
-        room: {path.parent.name for path in (ROOT / room).glob('*/__init__.py')}
-        for room in (
-            *('sonar_imm/trackers', 'sonar_imm_tools/simulation', 'sonar_imm_tools/evaluation'),
-        )
+        room: {path.parent.name for path in (ROOT / room).glob('*/__init__.py')} for room in rooms
     }
     inputs = {path.stem for path in (ROOT / 'msg_adapters' / 'inputs').glob('*.py')}
     folders['msg_adapters/inputs'] = inputs - {'__init__', 'topic'}
@@ -227,9 +224,6 @@ def test_every_folder_of_a_system_is_listed_and_built():
 
 
 def test_default_parameter_file_holds_the_defaults():
-    from sonar_imm.parameters import parameters_from_yaml
-    from sonar_imm.trackers import SYSTEMS
-
     for system in SYSTEMS.values():
         text = (ROOT / 'config' / f'{system.name}.yaml').read_text(encoding='utf-8')
         values = parameters_from_yaml(text, node_name=system.name)
@@ -270,8 +264,6 @@ sys.exit(main())
 
 
 def test_the_page_of_commands_names_every_subcommand():
-    from sonar_imm_tools.cli import COMMANDS
-
     page = (ROOT / 'docs' / 'reference' / 'commands.md').read_text(encoding='utf-8')
     table = page.partition('| subcommand |')[2].partition('\n\n')[0]
     assert set(re.findall(r'^\| `([a-z]+)', table, re.MULTILINE)) == set(COMMANDS)

@@ -157,19 +157,12 @@ def test_on_a_phone_each_cell_has_the_head_of_its_column(made):
     assert shown.endswith('<td>')
 
 
-# -- each row of SECURITY.md names a file of tests that exists --
-
-ROWS = [
-    line
-    for line in (ROOT / 'SECURITY.md').read_text(encoding='utf-8').splitlines()
-    if line.startswith('| ')
-][1:]
-
-
-@pytest.mark.parametrize('row', ROWS)
-def test_every_row_names_a_file_of_tests(row):
-    (name,) = re.findall(r'`(test/[\w/]+\.py)` \|$', row)
-    assert 'def test_' in (ROOT / name).read_text(encoding='utf-8')
+def test_every_row_of_the_page_of_security_names_a_file_of_tests():
+    rows = re.findall(r'^\| .*', (ROOT / 'SECURITY.md').read_text(encoding='utf-8'), re.MULTILINE)
+    for row in rows[1:]:
+        (name,) = re.findall(r'`(test/[\w/]+\.py)` \|$', row)
+        assert 'def test_' in (ROOT / name).read_text(encoding='utf-8')
+    assert len(rows) > 2
 
 
 # -- pages with measured numbers: each is that of its file, and one that is missing fails --

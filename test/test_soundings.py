@@ -37,9 +37,7 @@ def test_one_row_for_each_bin_with_an_echo_in_the_types_of_the_contract():
     assert (soundings.stamp_ns, soundings.frame_id) == (7, 'map')
     columns = soundings.columns  # without layover there is one surface
     assert (columns['surface'] == 1).all() and (columns['existence'] == 0.0).all()
-
-
-def test_rows_that_are_not_known_throughout_are_left_out():
+    # Rows that are not known throughout are left out.
     vertical = np.array([0.1, np.nan, 0.1, np.inf, 1e300, 0.1])
     soundings = soundings_of(estimate(vertical_uncertainty=vertical))
     assert soundings.columns['x'].tolist() == [0.0, 15.0]
@@ -61,9 +59,6 @@ def test_a_second_surface_follows_the_first_one_of_its_bin():
     assert columns['x'].tolist() == [0.0, 3.0, 10.0, 9.0, 12.0, 15.0]
     assert (columns['px'][2], columns['py'][2], columns['pz'][2]) == (10.0, 11.0, 12.0)
     assert columns['beam_angle'][2] == 13.0 and columns['vertical_uncertainty'][2] == 15.0
-
-
-def test_estimates_without_navigation_have_no_soundings():
-    plain = estimate()
+    plain = estimate()  # without navigation there are no soundings
     extras = {k: v for k, v in plain.extras.items() if 'uncertainty' not in k}
     assert soundings_of(evolve(plain, extras=extras)) is None

@@ -39,8 +39,8 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(scope='module')
 def threads_of(tmp_path_factory):
-    """Run Python with `arguments`; how many threads the process has at its end, with nothing said
-    of threads in its environment but `said`."""
+    """How many threads Python with `arguments` has at its end, with nothing said of threads in its
+    environment but `said`."""
     tmp_path = tmp_path_factory.mktemp('witness')
     (tmp_path / 'sitecustomize.py').write_text(WITNESS)
 
@@ -76,13 +76,10 @@ main()
 INFO = ('-m', 'sonar_imm_tools.cli', 'info', str(ROOT / 'bags' / 'diver_table1'))
 
 
-def test_the_command_has_one_thread(threads_of, loaded_alone):
+def test_the_command_has_one_thread_or_what_the_user_says(threads_of, loaded_alone):
     assert threads_of(*INFO) == 1
-
-
-@pytest.mark.parametrize('name', ['OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS'])
-def test_what_the_user_says_wins(threads_of, loaded_alone, name):
-    assert threads_of(*INFO, **{name: '2'}) == 2
+    for name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS'):
+        assert threads_of(*INFO, **{name: '2'}) == 2
 
 
 def test_the_library_leaves_the_process_alone(threads_of, loaded_alone):

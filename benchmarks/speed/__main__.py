@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 
 """The cost of a step of each tracker, as a file of results: what `sonar-imm bench` measures; of a
-record by kernels for other processors; and of the first start.
+record by kernels for other processors; of the first start; and of `sonar-imm convert`.
 
     python -m benchmarks.speed --out docs/results/speed.json
     python -m benchmarks.speed --parts "first start" --add --out docs/results/speed.json
@@ -28,6 +28,7 @@ import numpy as np
 
 from benchmarks.speed import benches_of
 from benchmarks.speed.cold_start import cold_start, STARTS
+from benchmarks.speed.conversions import CASES, conversion
 from benchmarks.speed.fathometer import bench_record, FathometerConfig, FathometerTracker, trace
 from benchmarks.study import in_fresh_process, Parts, study
 
@@ -39,7 +40,7 @@ TARGETS = {
     'generic': {'NUMBA_CPU_NAME': 'generic', 'NUMBA_CPU_FEATURES': ''},
 }
 """Processors that numba compiles for, by its own variables: see docker/numba_target.sh."""
-PARTS = ('steps', 'kernel targets', 'first start')
+PARTS = ('steps', 'kernel targets', 'first start', 'conversions')
 
 
 def main(rounds: int = 7, parts: Sequence[str] = PARTS, steps: Sequence[str] = STEPS) -> Parts:
@@ -56,6 +57,8 @@ def main(rounds: int = 7, parts: Sequence[str] = PARTS, steps: Sequence[str] = S
             # Read when numba is imported, which the process does before it is called.
             os.environ['NUMBA_CACHE_DIR'] = cache
             yield {'first start': {name: in_fresh_process(cold_start, case, cache)}}
+    for name in CASES if 'conversions' in parts else ():
+        yield {'conversions': {name: conversion(name, 3)}}
 
 
 def kernel_targets(rounds: int) -> dict[str, Any]:

@@ -56,9 +56,6 @@ class TablePublisher:
             self._learn(message)
         self._publisher.publish(message if self._start is None else self._serialised(message))
 
-    def get_subscription_count(self) -> int:
-        return int(self._publisher.get_subscription_count())
-
     def _learn(self, message: PointCloud2) -> None:
         self._like = _of(message)
         empty = PointCloud2(

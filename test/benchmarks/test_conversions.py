@@ -15,8 +15,9 @@ from argparse import Namespace
 import numpy as np
 import pytest
 
-from benchmarks import conversions
-from benchmarks.recordings import autoferry, DATA, scans_of, truth_of
+from benchmarks.recordings import autoferry, scans_of, truth_of
+from benchmarks.speed import conversions
+from benchmarks.study import DATA
 from benchmarks.typical_seed import readme, scored, typical
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import Limit

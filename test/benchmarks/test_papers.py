@@ -12,7 +12,6 @@ computed elsewhere and on whole recordings; of divers equation (1), the model se
 study runs."""
 
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 from helpers.bathymetry_cases import floor
@@ -110,7 +109,6 @@ def test_a_bootstrap_filter_does_not_find_the_reflectors(drift):
     assert distance(drift, BOOTSTRAP, order_min=7, order_max=7) > 0.5
 
 
-SECTION5 = Path(__file__).parents[1] / 'vectors' / 'obstacle_sea' / 'paper_section5.npz'
 GRID = np.arange(-12.0, 12.025, 0.05)
 NOISE_FREE = ('approach_dst+0.5_noisefree', 'approach_dst+3_noisefree')
 
@@ -165,8 +163,8 @@ def test_poses_are_not_invented():
 @pytest.mark.parametrize('echo', ['hand', 'noisy'])
 def test_curves_of_the_papers_encounters(body, echo):
     """The same pings read by eye and by a noisy detector: curves computed elsewhere."""
-    with np.load(SECTION5) as file:
-        values = {key.removeprefix(f'{body}/'): file[key] for key in file.files if body in key}
+    file = load_vectors('obstacle_sea/paper_section5')
+    values = {key.removeprefix(f'{body}/'): file[key] for key in file if body in key}
     z = np.column_stack([values[f'{echo}_range'], values[f'{echo}_azimuth']])
     seen = np.isfinite(z).all(axis=1)
     poses = Pose(values['sonar_p_ned'][seen], values['sonar_R_ned'][seen])
@@ -196,7 +194,7 @@ def test_the_study_has_all_its_tables():
 
 
 PRIOR = np.array([[0.8, 0.15, 0.05], [0.3, 0.5, 0.2], [0.1, 0.2, 0.7]])
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'diver'
+REFERENCE = load_vectors('diver/imm_reference')
 
 
 def learnt(chain, mu):
@@ -245,9 +243,8 @@ def test_impossible_transitions_stay_impossible(form):
 
 
 def test_the_guarded_product_in_a_filter_is_that_of_the_reference():
-    with np.load(VECTORS / 'imm_reference.npz') as reference:
-        names = (name for name in reference if name.startswith('A6_world16_adaptA_guard/'))
-        given = {name.partition('/')[2]: reference[name] for name in names}
+    names = (name for name in REFERENCE if name.startswith('A6_world16_adaptA_guard/'))
+    given = {name.partition('/')[2]: REFERENCE[name] for name in names}
     models = SimpleNamespace(
         initial_states=lambda z, R: tuple(given[name][None, None] for name in ('x0', 'P0', 'mu0')),
         motion=lambda dt: Motion(given['F'], given['Q'], given['B']),
@@ -271,9 +268,8 @@ def test_world_headings_are_those_of_the_reference(monkeypatch):
     own = checked(diver_paper.WorldHeadings(config))
     F, Q, B = own.motion(1.0)
     ours = {'F': F, 'Q': Q, 'B': B, 'E': own.joint.E, 'Pi': own.transition}
-    with np.load(VECTORS / 'imm_reference.npz') as reference:
-        for key, value in ours.items():
-            np.testing.assert_allclose(value, reference[f'A4_world16/{key}'], atol=1e-12)
+    for key, value in ours.items():
+        np.testing.assert_allclose(value, REFERENCE[f'A4_world16/{key}'], atol=1e-12)
 
 
 def test_world_headings_compose_in_position():

@@ -7,8 +7,8 @@
 # language governing permissions and limitations under the License.
 
 """The harness of the studies: options from parameters, tables as they come, one file; studies in
-their smallest size, whose numbers the pages find; the tables of docs/reliability.md are those of
-its results, and what falls short is said; and minutes of a day at sea, offline."""
+their smallest size, whose numbers the pages find; what of reliability falls short is said; and
+minutes of a day at sea, offline."""
 
 from collections.abc import Sequence
 from datetime import date
@@ -123,18 +123,18 @@ def test_the_command_of_every_result_works(command, monkeypatch):
 SMALL = {
     'bathymetry_paper': ({'pings': 1, 'parts': ['methods']}, {}, 'methods>defaults>patch'),
     'bathymetry_sea': ({'pings': 2, 'only': 'nadir'}, {}, 'cases>nadir, terrain>rmse_m'),
-    'bathymetry_surfaces': (
-        {'pings': 1},
+    'bathymetry_accuracy': (
+        {'object_pings': 1, 'parts': ['resolved']},
         {'SIZES': {'ledge': (2.0, 3.0)}, 'BANDS': ((17.0, 77.0),)}
-        | {'SETTINGS': {'8 staves': {}}, 'FLOORS': {'flat': ('thermal', {'patch_std': 0.0})}},
+        | {'SETTINGS': {'8 staves': {}}, 'BARE': {'flat': ('thermal', {'patch_std': 0.0})}},
         'resolved>ledge, 8 staves>rmse_m',
     ),
-    'fathometer_gaps': (
-        {'runs': 1, 'particles': 200, 'drawn': 2, 'cases': ['30 missing, walk 0.1 m']},
+    'fathometer_sea': (
+        {'runs': 1, 'particles': 200, 'drawn': 2, 'parts': ['30 missing, walk 0.1 m']},
         {},
-        'table>30 missing, walk 0.1 m, Kalman>inside',
+        'gaps>30 missing, walk 0.1 m, Kalman>inside',
     ),
-    'obstacle_accuracy': ({'runs': 5, 'cases': ['images']}, {}, 'images>found>steady>21 dB'),
+    'obstacle_accuracy': ({'pictures': 5, 'parts': ['images']}, {}, 'images>found>steady>21 dB'),
 }
 """Options, what is made smaller besides, and a number."""
 
@@ -152,9 +152,6 @@ def test_a_small_study_has_its_numbers(name, monkeypatch):
         found = next(iter(found.values())) if key == '*' else found[key]
     assert math.isfinite(found)
 
-
-if not (ROOT / 'docs' / 'reliability.md').is_file():
-    pytest.skip('these tests read the source tree', allow_module_level=True)
 
 GOOD = {
     'bounds': {
@@ -186,24 +183,6 @@ GOOD = {
 }  # fmt: skip
 
 
-def test_the_page_says_what_the_results_say():
-    parts = json.loads(reliability.RESULT.read_text(encoding='utf-8'))
-    page = reliability.PAGE.read_text(encoding='utf-8')
-    shown = reliability.COLUMNS.keys() | reliability.SENTENCES.keys() | {'faults'}
-    assert set(reliability.PARTS) == shown == reliability.PROGRAMS.keys()
-    assert all(f'<!-- reliability: {name} -->' in page for name in reliability.PARTS)
-    assert page == reliability.page_of(page, parts), 'run python -m benchmarks.reliability'
-
-
-def test_a_table_is_made_of_its_part():
-    page = 'a\n<!-- reliability: faults -->\nold\n<!-- /reliability -->\nb\n'
-    text = reliability.page_of(page, GOOD)
-    assert '| a burst |  | 2; 7 too_late |' in text and 'old' not in text
-    assert text.startswith('a\n') and text.endswith('b\n')
-    assert reliability.page_of(text, GOOD) == text
-    assert 'Not measured yet' in reliability.page_of(page, {})
-
-
 @pytest.mark.parametrize(
     'part, row, change',
     [
@@ -225,8 +204,7 @@ def test_what_falls_short_is_said(part, row, change):
 
 @pytest.fixture
 def toy(tmp_path, monkeypatch):
-    """Two parts, whose programs note each row that they measure; the file and the page are others.
-    Gives the folder of the parts and what they noted."""
+    """The folder of a part whose program notes each row that it measures."""
     program = """
 import json, pathlib, sys
 file, notes = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2])
@@ -241,11 +219,8 @@ sys.exit(3)
 """
     programs = {'signals': ('-c', program, '{}/signals.json', '{}/notes')}
     monkeypatch.setattr(reliability, 'RESULT', tmp_path / 'result.json')
-    monkeypatch.setattr(reliability, 'PAGE', tmp_path / 'page.md')
     monkeypatch.setattr(reliability, 'PROGRAMS', programs)
     monkeypatch.setattr(reliability, 'PARTS', ('signals',))
-    mark = '<!-- reliability: {} -->\n<!-- /reliability -->\n'
-    reliability.PAGE.write_text(mark.format('run') + mark.format('signals'), encoding='utf-8')
     return tmp_path / 'parts'
 
 
@@ -261,7 +236,8 @@ def test_parts_are_run_and_what_was_broken_off_goes_on(toy, monkeypatch, capsys)
     (toy / 'signals.json').write_text(json.dumps(rows))
     assert run('--run') == 0
     assert (toy / 'notes').read_text() == 'SIGHUP '  # the other one was there
-    assert '4 of 4 nodes ended so: SIGINT, SIGHUP.' in reliability.PAGE.read_text()
+    written = json.loads(reliability.RESULT.read_text())
+    assert [row['clean'] for row in written['signals']] == [2, 2]
     assert 'signals: ended with exit code 3' in capsys.readouterr().out
     rows = json.loads((toy / 'signals.json').read_text())
     rows[0]['clean'] = 1

@@ -133,14 +133,10 @@ LACKING = 'attitude_std_deg, heading_std_deg, position_std, sound_speed_std'
 
 @pytest.mark.parametrize(
     'record, sentence',
-    [
-        (None, '1 line without run.json (line_001): default error budget'),
-        (
-            other(parameters={'sound_speed': 1500.0, 'heave_std': 0.05}),
-            f'1 line without {LACKING} (line_001): default values',
-        ),
-    ],
-)
+    [(None, '1 line without run.json (line_001): default error budget'),
+     (other(parameters={'sound_speed': 1500.0, 'heave_std': 0.05}),
+      f'1 line without {LACKING} (line_001): default values')],
+)  # fmt: skip
 def test_what_a_run_does_not_state_is_assumed_and_named(runs, tmp_path, capsys, record, sentence):
     """But a sound speed never is."""
     (runs / 'line_001' / 'run.json').unlink()

@@ -25,11 +25,8 @@ from sonar_imm_tools.recordings.measurements import fitting_topics, instruments
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.writer import BagWriter
 
-STATED = ('tilt_std_deg', 'spacing_std', 'sound_speed_std')
-EXACT = tuple(word for name in STATED for word in ('--set', f'{name}=0'))
+EXACT = '--set tilt_std_deg=0 --set spacing_std=0 --set sound_speed_std=0'.split()
 """What a simulated recording says of its array; a copy under other names says nothing."""
-
-
 SIDES = {'port': 'PORT', 'starboard': 'stbd'}
 """Sides, and words for them."""
 

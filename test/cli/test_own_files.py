@@ -8,6 +8,7 @@
 
 """No command writes over a file of a run, of a recording or of the user; and `view`."""
 
+from itertools import product
 import json
 from pathlib import Path
 import shutil
@@ -131,15 +132,16 @@ def test_tune_keeps_the_recording_and_check_replaces_only_runs(here, capsys):
     assert mine.read_text() == 'mine'
 
 
-@pytest.mark.parametrize('origin', [3, 'x', [1], {'a': 1}, {'latitude': 'x', 'longitude': 1}])
-def test_an_export_of_a_hostile_run_json_is_one_sentence(here, capsys, origin):
+def test_an_export_of_a_hostile_run_json_is_one_sentence(here, capsys):
     record = here / 'out' / 'run.json'
     good, place = json.loads(record.read_text()), ('--crs', 32632, '--origin', '500000,6000000')
-    for key, *words in (('origin', 'tracks.gpx'), ('landmarks', 'map.geojson', '--map', *place)):
-        record.write_text(json.dumps({**good, key: origin}))
-        assert run('export', here / 'out', here / words[0], *words[1:]) == 2
+    ways = ('origin', 'tracks.gpx'), ('landmarks', 'map.geojson', '--map', *place)
+    hostile = 3, 'x', [1], {'a': 1}, {'latitude': 'x', 'longitude': 1}
+    for value, (key, name, *words) in product(hostile, ways):
+        record.write_text(json.dumps({**good, key: value}))
+        assert run('export', here / 'out', here / name, *words) == 2
         assert f'{key!r} in the run.json' in capsys.readouterr().err
-        assert not (here / words[0]).exists()
+        assert not (here / name).exists()
 
 
 # -- `view`: the report in the browser, the file for Rerun --

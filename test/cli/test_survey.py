@@ -415,19 +415,16 @@ def record(line, bag, *topics):
 @pytest.mark.parametrize(
     'change, words, said',
     [
-        ('none', '', 'holds no line'),
-        ('missing', '', 'is no folder'),
+        ('none', '', 'holds no line'), ('missing', '', 'is no folder'),
         ('crs', '', 'line_000 is in EPSG 32632 and line_001 in EPSG 32633'),
         ('apart', '--adjust', 'no two lines overlap'),
         ('broken', '', 'no line can be read; the first: '),
-        ('', '--resolution 0.001', 'too large'),
-        ('', '--fix other', 'no line other'),
-        ('', '--crs 1', 'EPSG number 1'),
-        ('', '--resolution fine', 'neither auto'),
+        ('', '--resolution 0.001', 'too large'), ('', '--fix other', 'no line other'),
+        ('', '--crs 1', 'EPSG number 1'), ('', '--resolution fine', 'neither auto'),
         ('', '--resume --overwrite', 'exclude'),
         ('', '--jobs 2 --scheduler tcp://a:1', 'exclude'),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_done_is_one_sentence_and_writes_nothing(
     lines, tmp_path, capsys, monkeypatch, change, words, said
 ):

@@ -103,10 +103,9 @@ def test_covariances_that_are_too_large_are_said_to_be_out_of_range(tmp_path, ca
 def test_bad_input_is_named(tmp_path, capsys):
     short, bag = dive(tmp_path, 5), dive(tmp_path, 30)
     for recording, name, sentence in (
-        (short, 'covariance_scale', 'too little to fit'),
+        (short, 'covariance_scale', 'too little to fit'), (bag, 'max_tracks', 'cannot be fitted'),
         (bag, 'covariance_scal', "did you mean 'covariance_scale'"),
-        (bag, 'max_tracks', 'cannot be fitted'),
-    ):
+    ):  # fmt: skip
         assert tune(recording, name=name) == 2
         assert sentence in capsys.readouterr().err
 
@@ -146,10 +145,8 @@ def fitting_of(peak, H):
 def test_standard_errors_are_those_of_the_inverse_of_the_curvature():
     H = np.array([[4.0, 3.0], [3.0, 9.0]])
     saddle = np.array([[1.0, 3.0], [3.0, 1.0]])
-    for peak, curvature, exact in (
-        (np.array([0.3, -0.2]), H, np.sqrt(np.diag(np.linalg.inv(H)))),
-        (np.zeros(2), saddle, np.full(2, np.inf)),
-    ):
+    known = np.array([0.3, -0.2]), H, np.sqrt(np.diag(np.linalg.inv(H)))
+    for peak, curvature, exact in (known, (np.zeros(2), saddle, np.full(2, np.inf))):
         fitting = fitting_of(peak, curvature)
         found = errors(fitting, peak, lambda points, at=fitting.posterior: [at(u) for u in points])
         assert found == pytest.approx(exact)
@@ -188,9 +185,7 @@ def tuned(monkeypatch):
 
     def tuned(numbers, names=('speed_std',)):
         monkeypatch.setattr(tuning, '_recording', lambda job: numbers)
-        tunables = tuple(
-            Tunable(name=name, start=1.0, std=3.0) for name in names or ('speed_std',)
-        )
+        tunables = tuple(Tunable(name=name, start=1.0, std=3.0) for name in names)
         job, split = SimpleNamespace(system='diver'), (len(numbers.z) // 2 - 1,)
         return tuning.tune(tuning.Fitting(jobs=(job,), tunables=tunables, split=split), 40)
 
@@ -199,13 +194,9 @@ def tuned(monkeypatch):
 
 def test_what_is_gained_is_of_each_half_by_what_the_other_one_told(tuned):
     numbers = Halves()
-    made = tuned(numbers)
-    first, second = numbers.z[:20], numbers.z[20:]
-    gained = [
-        norm.logpdf(half, scale=scale).sum() - norm.logpdf(half).sum()
-        for half, scale in ((second, 3.0), (first, 2.0))
-    ]
-    assert made.held_out_gain == pytest.approx(sum(gained) / 40, abs=0.02)
+    made, told = tuned(numbers), np.repeat([2.0, 3.0], 20)
+    gained = norm.logpdf(numbers.z, scale=told) - norm.logpdf(numbers.z)
+    assert made.held_out_gain == pytest.approx(gained.mean(), abs=0.02)
     assert made.values['speed_std'] == pytest.approx(math.sqrt(6.5), abs=0.1)
     assert made.log_likelihood_before == pytest.approx(norm.logpdf(numbers.z).sum())
     (row,) = made.parameters
@@ -325,11 +316,8 @@ def test_a_fix_that_comes_singly_is_of_one_track():
 
 
 def test_the_score_of_a_scan_is_that_of_all_joint_events():
-    f, r, p = (
-        np.array([[0.2, 0.003], [0.1, 0.05]]),
-        (0.9, 0.4),
-        DiverConfig().detection_probability,
-    )
+    f, r = np.array([[0.2, 0.003], [0.1, 0.05]]), (0.9, 0.4)
+    p = DiverConfig().detection_probability
     score, tracker, other = score_of_two(f, is_complete=True)
     total, exists = 0.0, [0.0, 0.0]
     for event in product((None, 0, 1), repeat=2):

@@ -181,20 +181,16 @@ def ais(path, spots):
     path.write_text('\r\n'.join(lines) + '\r\n')
 
 
-def receptions(spots):
-    """Seconds at which each station hears each ping."""
-    for k, each in enumerate(spots):
-        place = np.array(each.place or (0.0, 0.0))
-        for number, station in enumerate(STATIONS):
-            yield k, each, number, each.seconds + np.linalg.norm(station - place) / 1500.0
-
-
 def heard(path, spots, head, row):
     """Receptions, and beside the file where the stations are."""
     rows = ['{},{:.9f},{:.9f}'.format(k, *place_of(*place)) for k, place in enumerate(STATIONS)]
     csv(path.with_name('stations.csv'), 'receiver,latitude,longitude', rows)
-    given = receptions(spots)
-    csv(path, head, [row.format(k, number, FIRST + t, each.name) for k, each, number, t in given])
+    rows = []
+    for k, each in enumerate(spots):
+        apart = np.linalg.norm(STATIONS - (each.place or (0.0, 0.0)), axis=1)
+        times = FIRST + each.seconds + apart / 1500.0
+        rows += [row.format(k, number, t, each.name) for number, t in enumerate(times)]
+    csv(path, head, rows)
 
 
 def telemetry(path, spots):

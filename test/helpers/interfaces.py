@@ -104,18 +104,9 @@ def build(folder):
         [*command, *options], cwd=folder, env=wheels, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-4000:]
-    return installed(folder)
-
-
-def installed(folder):
-    """The environment in which Python finds what was built in `folder`."""
-    libraries = folder / 'install' / 'lib'
-    (packages,) = libraries.glob('python*/site-packages')
-    paths = {
-        'PYTHONPATH': packages, 'LD_LIBRARY_PATH': libraries,
-        'AMENT_PREFIX_PATH': folder / 'install',
-    }  # fmt: skip
-    found = dict(os.environ)
+    made, found = folder / 'install', dict(os.environ)
+    (packages,) = made.glob('lib/python*/site-packages')
+    paths = {'PYTHONPATH': packages, 'LD_LIBRARY_PATH': made / 'lib', 'AMENT_PREFIX_PATH': made}
     for name, path in paths.items():
         found[name] = os.pathsep.join([str(path), *filter(None, [found.get(name)])])
     return found

@@ -68,9 +68,7 @@ class Bench:
 
     def start(self, kind, *args, **options):
         """A node of this class, which is spun."""
-        return self.add(kind(*args, context=self.context, **options))
-
-    def add(self, node):
+        node = kind(*args, context=self.context, **options)
         self.nodes.append(node)
         self.executor.add_node(node)
         return node

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Why a message is refused."""
+"""Why a message is refused, and YAML of a few lines that stands for a billion values."""
 
 import pytest
 
@@ -19,3 +19,12 @@ def reason(read, *message, **options):
         read(*message, **options)
     assert caught.value.sentence[-1] != '.' and '\n' not in caught.value.sentence
     return caught.value.reason
+
+
+def multiplying(form):
+    """Ten values in ten in ten: `form` has a place for the references, ``'[{}]'`` say."""
+    lines = ['a0: &a0 {x: 1}']
+    for k in range(1, 10):
+        references = form.format(', '.join([f'*a{k - 1}'] * 10))
+        lines.append(f'a{k}: &a{k} {references}')
+    return '\n'.join(lines)

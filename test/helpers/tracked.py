@@ -49,7 +49,8 @@ class Tracked:
             read = measurements_of(reader, self.system.name, settings=self.config.as_dict())
             found = [item.measurement for item in read]
         good = [m for m in found if m is not None and not isinstance(m, Rejection)]
-        self.input, tracker = good[: MOST[self.system.name]], self.build()
+        self.input = good[: MOST[self.system.name]]
+        tracker = self.build()
         self.whole = published(tracker, self.input)
         self.counts = tracker.counts
 

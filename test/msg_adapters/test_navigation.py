@@ -110,14 +110,12 @@ def test_an_frd_vehicle_in_ned_becomes_an_flu_vehicle_in_enu():
 
 @pytest.mark.filterwarnings('error')
 def test_a_pose_that_cannot_be_used_is_refused():
+    none = [0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0105], [0.0, 1e300, 0.0, 1e300]
     for name, values, code in (
-        ('orientation', [0.0, 0.0, 0.0, 0.0], 'bad_orientation'),
-        ('orientation', [0.0, 0.0, 0.0, 1.0105], 'bad_orientation'),
-        ('orientation', [0.0, 1e300, 0.0, 1e300], 'bad_orientation'),
-        ('orientation', [0.0, np.nan, 0.0, 1.0], 'nan'),
-        ('position', [0.0, 0.0, np.inf], 'nan'),
+        *(('orientation', each, 'bad_orientation') for each in none),
+        ('orientation', [0.0, np.nan, 0.0, 1.0], 'nan'), ('position', [0.0, 0.0, np.inf], 'nan'),
         ('position', [0.0, 2e8, 0.0], 'out_of_range'),
-    ):
+    ):  # fmt: skip
         places = {f'pose__pose__{name}__{axis}': value for axis, value in zip('xyzw', values)}
         assert reason(read_navigation, marine.put(odometry(), **places)) == code
 

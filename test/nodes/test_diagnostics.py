@@ -287,6 +287,8 @@ def test_a_level_rises_after_two_bad_periods_falls_after_five_good_ones_and_does
     found = of(np.random.default_rng(5).random(600) < 0.5)
     assert np.count_nonzero(np.diff(found)) <= 2 * 600 * 0.5**6 + 8 and np.mean(found) > 0.8
     assert not any(of([1, 0] * 100))  # every other period, never two in a row
+    # All refused in one period and some in the next are some in both.
+    assert levels([({'fix': 1 + second % 2}, ['fix']) for second in range(6)]) == [0] + [1] * 5
 
 
 @pytest.mark.parametrize('beside', ['', 'heard', 'heard, and refused once'])
@@ -309,10 +311,6 @@ def test_losses_of_a_latched_input_are_over_as_others():
     lost = [{'lost': {'/tf_static': min(second + 1, 4)}} for second in range(16)]
     found = levels([({'fix': 1, 'tf_static': 1 - k % 2}, (), more) for k, more in enumerate(lost)])
     assert found[2:4] == [1, 1] and found[-1] == 0
-
-
-def test_all_refused_in_one_period_and_some_in_the_next_are_some_in_both():
-    assert levels([({'fix': 1 + second % 2}, ['fix']) for second in range(6)]) == [0] + [1] * 5
 
 
 def test_the_health_of_a_node_is_its_worst_entry(desk):

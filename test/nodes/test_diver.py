@@ -40,10 +40,8 @@ def rig(make_bench):
     return bench, node, *bench.hear(node, odometry=Odometry, model_probabilities=JointState)
 
 
-def a_fix(stamp_ns, x, y, covariance=None):
-    """A fix that is good to a metre."""
-    covariance = np.eye(2) if covariance is None else covariance
-    fix = Fix(stamp_ns=stamp_ns, position=(x, y, 0), covariance=covariance, frame_id='map')
+def a_fix(stamp_ns, x, y):
+    fix = Fix(stamp_ns=stamp_ns, position=(x, y, 0), covariance=np.eye(2), frame_id='map')
     return write_fix(fix, make)
 
 

@@ -64,10 +64,6 @@ def estimate_of(system):
         )
 
 
-def layout_of(system):
-    return json.loads(shared_file(f'config/foxglove_{system}.json').read_text())
-
-
 @pytest.mark.parametrize('system', SYSTEMS)
 def test_layouts_name_what_the_node_has(system, make_bench):
     topics, estimate = topics_of(system, make_bench), estimate_of(system)
@@ -76,8 +72,8 @@ def test_layouts_name_what_the_node_has(system, make_bench):
 
 
 def check_foxglove(system, topics, estimate):
-    panels = layout_of(system)['configById']
-    columns = estimate.columns()
+    layout = json.loads(shared_file(f'config/foxglove_{system}.json').read_text())
+    panels, columns = layout['configById'], estimate.columns()
     for name, panel in panels.items():
         kind = name.partition('!')[0]
         if kind == '3D':
@@ -90,7 +86,7 @@ def check_foxglove(system, topics, estimate):
         else:
             assert topics[panel['topicToRender']] == 'diagnostic_msgs/msg/DiagnosticArray'
             assert panel.get('selectedName') in {None, *topics['states']}
-    assert placed(layout_of(system)['layout']) == set(panels)
+    assert placed(layout['layout']) == set(panels)
 
 
 def check_path(path, topics, estimate):

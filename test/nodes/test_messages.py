@@ -31,29 +31,23 @@ from sonar_imm.nodes.outputs import ProcessedPublisher, TablePublisher
 from sonar_imm.nodes.qos import Endpoints, input_qos, output_qos, SequenceGaps
 
 
-def test_scalars_are_cast():
+def test_scalars_are_cast_and_squares_flattened():
     point = make('geometry_msgs/msg/Point', x=1, y=np.float32(0.5), z=np.int64(-2))
     assert (point.x, point.y, point.z) == (1.0, 0.5, -2.0)
     assert type(point.y) is float
     field = make('sensor_msgs/msg/PointField', name=np.str_('x'), offset=np.int32(4), count=True)
     assert (field.name, field.offset, type(field.count)) == ('x', 4, int)
-
-
-def test_a_square_covariance_is_flattened_and_its_size_checked():
+    # A square covariance is flattened, and its size checked.
     made = make('geometry_msgs/msg/PoseWithCovariance', covariance=np.arange(36.0).reshape(6, 6))
     assert made.covariance.tolist() == list(range(36))
     with pytest.raises(ValueError, match='36 numbers are needed, got 35'):
         make('geometry_msgs/msg/PoseWithCovariance', covariance=[0.0] * 35)
 
 
-@pytest.mark.parametrize(
-    'data', [b'\x01\x02', bytearray(b'\x01\x02'), [1, 2], np.array([1, 9, 2, 9], np.uint8)[::2]]
-)
-def test_bulk_bytes_take_any_form(data):
-    assert make('sensor_msgs/msg/PointCloud2', data=data).data == array.array('B', [1, 2])
-
-
-def test_bulk_doubles_from_float32_strings_from_a_tuple_and_messages_in_messages():
+def test_bulk_takes_any_form_and_messages_are_in_messages():
+    strided = np.array([1, 9, 2, 9], np.uint8)[::2]
+    for data in (b'\x01\x02', bytearray(b'\x01\x02'), [1, 2], strided):
+        assert make('sensor_msgs/msg/PointCloud2', data=data).data == array.array('B', [1, 2])
     position, stamp = np.array([0.25, 0.5], np.float32), make('builtin_interfaces/msg/Time', sec=3)
     header = make('std_msgs/msg/Header', frame_id='map', stamp=stamp)
     made = make('sensor_msgs/msg/JointState', name=('a', 'b'), position=position, header=header)
@@ -123,11 +117,8 @@ def test_every_answer_has_its_counts_and_its_stamp():
     paper = Paper()
     answers = ProcessedPublisher(paper)
     stamp = table().header.stamp
-    for counts, when in (
-        ({'a': 1, 'b': 2}, None),
-        ({'a': 70000, 'b': 3}, stamp),
-        ({'a': 1, 'b': 0}, None),
-    ):
+    for *given, when in ((1, 2, None), (70000, 3, stamp), (1, 0, None)):
+        counts = dict(zip('ab', given))
         answers.publish(counts, when)
         message = paper.message
         assert message.data == array.array('B', np.array([*counts.values()], '<f8').tobytes())

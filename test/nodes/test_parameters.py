@@ -244,9 +244,7 @@ def test_a_file_for_another_node_is_named(tmp_path):
     beside = own_parameters(tmp_path)
     assert load_config(SYSTEMS['diver'], beside, {})[1].frame_id == ''
     assert load_config(SYSTEMS['obstacle'], beside, {})[1].frame_id == 'odom'
-
-
-def test_sections_are_found_in_namespaces():
+    # Sections are found in namespaces.
     text = (
         '/**:\n  ros__parameters: {}\n/auv1:\n  bow:\n    ros__parameters: {}\n'
         'diver:\n  ros__parameters:\n    a: 1\n'
@@ -261,7 +259,6 @@ def test_sections_are_found_in_namespaces():
 FOLDER = Path(__file__).resolve().parents[2] / 'config' / 'sros2'
 
 
-# So that the node starts where messages of others are not installed.
 def allowed(name, node):
     """Absolute names by what is allowed, from the file."""
     policy = ElementTree.parse(FOLDER / f'{name}.xml').getroot()

@@ -458,10 +458,8 @@ def test_odd_places_are_one_sentence_and_stay(out, tmp_path, monkeypatch, name, 
     (tmp_path / 'link').symlink_to(out)
     (tmp_path / 'file').write_text('mine')
     os.mkfifo(tmp_path / 'fifo')
-    target = {
-        **{kind: tmp_path / kind for kind in ('link', 'file', 'fifo')}, '.': Path('.'),
-        '..': Path('..'), 'bag': out / 'estimate',
-    }.get(name, out)  # fmt: skip
+    targets = {kind: tmp_path / kind for kind in ('link', 'file', 'fifo')}
+    targets |= {'.': Path('.'), '..': Path('..'), 'bag': out / 'estimate'}
     if name in ('.', '..'):
         monkeypatch.chdir(out if name == '.' else out / 'notes')
     elif name == 'home':
@@ -471,7 +469,7 @@ def test_odd_places_are_one_sentence_and_stay(out, tmp_path, monkeypatch, name, 
     before = contents(out)
     inputs = [out / 'estimate'] if name in ('bag', 'parent') else []
     with pytest.raises(BagError, match=words):
-        make(target, NEW, overwrite=True, inputs=inputs)
+        make(targets.get(name, out), NEW, overwrite=True, inputs=inputs)
     assert contents(out) == before
 
 

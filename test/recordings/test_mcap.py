@@ -370,14 +370,10 @@ def test_a_file_without_checksums_is_read_as_it_is(long, tmp_path, spoilt):
     assert not wrong_sums(file)
 
 
-@pytest.mark.parametrize(
-    'compressed, size, step_ns, chunks', [(False, 1000, 10**9, 4), (True, 40_000, 10**6, 5)]
-)
-def test_a_bit_costs_one_chunk_of_a_short_recording(
-    tmp_path, spoilt, compressed, size, step_ns, chunks
-):
+@pytest.mark.parametrize('how, chunks', [((500, 10**9, False), 4), ((20_000, 10**6, True), 5)])
+def test_a_bit_costs_one_chunk_of_a_short_recording(tmp_path, spoilt, how, chunks):
     """Less than a megabyte, and less than a minute: chunks end by time, or by size."""
-    path = of_length(tmp_path / 'bag', 40, size // 2, step_ns, compressed)
+    path = of_length(tmp_path / 'bag', 40, *how)
     (_, whole), problems = content(path)
     starts, _ = chunks_of(path)
     assert len(whole) == 40 and not problems and chunks <= len(starts) <= 2 * chunks

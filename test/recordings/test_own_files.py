@@ -90,15 +90,15 @@ def test_track_uses_them_unless_told_otherwise(bag, tmp_path, capsys):
 
 def test_a_limit_and_how_a_recording_is_made_again_are_kept(tmp_path):
     assert own_limit(tmp_path) is None
-    for recipe in (None, [], ['--scenario', 'a scene', '--set', 'fading=']):
-        if recipe is not None:
-            own_files.write_own_limit(tmp_path, 0.88, recipe)
-            assert own_limit(tmp_path) == 0.88
-        if recipe:
-            assert own_files.own_recipe(tmp_path) == recipe
-            continue
+    recipe = ['--scenario', 'a scene', '--set', 'fading=']
+    own_files.write_own_limit(tmp_path, 0.88, recipe)
+    assert own_limit(tmp_path) == 0.88 and own_files.own_recipe(tmp_path) == recipe
+    own_files.write_own_limit(tmp_path, 0.5, [])
+    assert own_limit(tmp_path) == 0.5
+    for _ in range(2):  # without a recipe, and without a file
         with pytest.raises(BagError, match='does not state how'):
             own_files.own_recipe(tmp_path)
+        (tmp_path / 'check.yaml').unlink(missing_ok=True)
 
 
 def test_any_other_limit_is_one_sentence(tmp_path):
@@ -176,11 +176,10 @@ def test_duplicates_upcasts_and_spikes_go_and_a_long_cast_keeps_what_it_needs(tm
 
 def test_what_is_no_profile_is_one_sentence(tmp_path):
     for rows, word in (
-        (['depth,temperature', '1,8'], 'no column of sound speed'),
+        (['depth,temperature', '1,8'], 'no column of sound speed'), ([''], 'no column of depth'),
         (['1 2 3', '4 5 6'], 'columns without names'),
         (['depth,speed', '1,15', '2,16'], 'between 1300 and 1700'),
-        ([''], 'no column of depth'),
-    ):
+    ):  # fmt: skip
         with pytest.raises(BagError, match=word):
             read_profile(write(tmp_path / 'a.csv', rows))
     with pytest.raises(BagError, match='cannot be read'):

@@ -289,13 +289,11 @@ def test_a_topic_map_chooses_and_a_wrong_one_is_explained(mixed):
         received = list(measurements_of(bag, 'diver', {'/pose': 'fix'}, world_frame='ned'))
         assert len(received) == 1 and received[0].measurement.position.tolist() == [2.0, 5.0, 0.0]
         for topics, words in (
-            ({'/pose': 'fixx'}, ["no input 'fixx'", "'fix'"]),
-            ({'/posee': 'fix'}, ["'/pose'"]),
-            ({'/other/fix': 'fix'}, ['std_msgs/msg/String', 'geometry_msgs/msg/PointStamped']),
-        ):
-            with pytest.raises(BagError) as caught:
+            ({'/pose': 'fixx'}, "no input 'fixx'.*'fix'"), ({'/posee': 'fix'}, "'/pose'"),
+            ({'/other/fix': 'fix'}, 'std_msgs/msg/String.*geometry_msgs/msg/PointStamped'),
+        ):  # fmt: skip
+            with pytest.raises(BagError, match=words):
                 list(measurements_of(bag, 'diver', topics))
-            assert all(word in caught.value.sentence for word in words)
 
 
 def test_when_nothing_fits_it_lists_what_is_there(tmp_path, fix_message):

@@ -12,7 +12,7 @@ import sqlite3
 import struct
 import time
 
-from helpers.anchors import multiplying
+from helpers.refusals import multiplying
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer

@@ -273,19 +273,17 @@ def test_without_names_every_estimate_is_heard_but_the_truth(link):
     assert listener.topics == ['/auv/diver/estimate'] and table.topic == '/auv/diver/estimate'
 
 
-@pytest.mark.parametrize(
-    'wanted, said',
-    [
-        ((), 'no topic that ends in /estimate was found within 0.1 s'),
-        (('diver/estimat',), r"nobody publishes /diver/estimat within .* mean '/diver/estimate'"),
-        (('diver/estimate',), 'nothing was published on /diver/estimate within 0.1 s'),
-        (('fix',), 'std_msgs/msg/Float64 and no table; ros2 topic echo /fix'),
-    ],
-)
-def test_silence_says_what_was_looked_for(link, wanted, said):
-    kinds = {'/diver/estimate': PointCloud2, '/fix': Float64} if wanted else {}
+def test_silence_says_what_was_looked_for(link):
+    with pytest.raises(LinkError, match='no topic that ends in /estimate was found within 0.1 s'):
+        list(TableListener(link, ()).tables(0.1))
+    kinds = {'/diver/estimate': PointCloud2, '/fix': Float64}
     for name, kind in kinds.items():
         link.node.create_publisher(kind, name, 10)
     assert link.wait_for(lambda: all(map(link.node.count_publishers, kinds)), 60.0)
-    with pytest.raises(LinkError, match=said):
-        list(TableListener(link, wanted).tables(0.1))
+    for wanted, said in (
+        (('diver/estimat',), r"nobody publishes /diver/estimat within .* mean '/diver/estimate'"),
+        (('diver/estimate',), 'nothing was published on /diver/estimate within 0.1 s'),
+        (('fix',), 'std_msgs/msg/Float64 and no table; ros2 topic echo /fix'),
+    ):
+        with pytest.raises(LinkError, match=said):
+            list(TableListener(link, wanted).tables(0.1))

@@ -29,12 +29,8 @@ import pytest
 from rcl_interfaces.srv import GetParameters
 
 from sonar_imm.nodes.qos import output_qos
-from sonar_imm_tools.replay.harness import (
-    local_discovery,
-    NodeProcess,
-    reserved_domain_id,
-    run_lockstep,
-)
+from sonar_imm_tools.replay import harness
+from sonar_imm_tools.replay.harness import NodeProcess
 from sonar_imm_tools.replay.link import Link, LinkError
 
 pytestmark = pytest.mark.system
@@ -45,13 +41,13 @@ def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(tmp_path):
     file.write_text('/**:\n  ros__parameters:\n    sound_speed: 1500\n')
     sentence = "parameter 'sound_speed' is a double: write 1500.0 instead of 1500"
     with pytest.raises(LinkError, match=f'exit code 2: diver: {sentence}'):
-        run_lockstep(BAGS / 'diver_table1', 'diver', params_file=file)
+        harness.run_lockstep(BAGS / 'diver_table1', 'diver', params_file=file)
 
 
 def test_unusable_arguments_end_in_one_line_and_exit_code_2():
     arguments = '--params-file', 'nowhere.yaml'
     with (
-        reserved_domain_id() as domain,
+        harness.reserved_domain_id() as domain,
         NodeProcess('diver', domain_id=domain, arguments=arguments) as node,
     ):
         assert node.process.wait(600.0) == 2
@@ -61,7 +57,7 @@ def test_unusable_arguments_end_in_one_line_and_exit_code_2():
 
 
 def test_a_node_under_nohup_outlives_its_terminal():
-    with reserved_domain_id() as domain:
+    with harness.reserved_domain_id() as domain:
         before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
         try:
             node = NodeProcess('diver', domain_id=domain)
@@ -133,7 +129,7 @@ def test_what_cannot_be_secured_does_not_start(name, words, tmp_path):
     for file in (*keys, 'governance.p7s', 'permissions.p7s'):
         (enclave / file).touch()
     command = [sys.executable, '-m', 'sonar_imm.nodes.diver', '--ros-args', '-e']
-    with reserved_domain_id() as domain:
+    with harness.reserved_domain_id() as domain:
         environment = {
             **os.environ, 'ROS_DOMAIN_ID': str(domain), 'ROS_SECURITY_KEYSTORE': str(tmp_path),
             'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'Enforce',
@@ -153,10 +149,13 @@ def start(tmp_path, monkeypatch):
     """Starts a node that keeps its kernels in a folder of its own; gives it and a link."""
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'kernels'))
     with contextlib.ExitStack() as stack:
-        domain = stack.enter_context(reserved_domain_id())
-        stack.enter_context(local_discovery())
+        domain = stack.enter_context(harness.reserved_domain_id())
+        stack.enter_context(harness.local_discovery())
         link = stack.enter_context(Link('asks', domain_id=domain))
-        yield lambda system: (stack.enter_context(NodeProcess(system, domain_id=domain)), link)
+        yield lambda system: (
+            stack.enter_context(NodeProcess(system, domain_id=domain)),
+            link,
+        )
 
 
 def wait_for(node, link, predicate):

@@ -44,7 +44,7 @@ from .explanations import (
     PingMeasurements,
     subset_ping,
 )
-from .heavy_tails import DEGREES, student_t_maxima, student_t_ping
+from .heavy_tails import DEGREES, GOOD_RESIDUAL, student_t_maxima, student_t_ping
 from .instruments import Layout
 from .known import Known
 from .models import ModelSet, start_depths
@@ -59,9 +59,6 @@ EMISSION_STD = 1e3
 
 FAR = 1e3
 """Standard deviation, m, of an unknown position about the receivers."""
-
-GOOD_RESIDUAL = 3.0
-"""Residual, in standard deviations, of an arrival that is equally likely an outlier."""
 
 OPTIMA = 3
 """Number of best positions of the ping alone from which models also start."""
@@ -370,22 +367,23 @@ def _explain_tag(
     """Associate the whole ping of a tag with one track.
 
     With `max_tracks: 1` the existing track takes every ping. Otherwise the best explanation inside
-    the gate does: confirmed tracks first, then tentative ones if fewer than half of the arrivals
-    fit.
+    the gate does if more than half of the arrivals fit, a confirmed track before a tentative one.
+    The ping of one tag is no miss of the others.
     """
     score = known['score'] + np.log1p(-config.detection_probability)
-    updates: dict[int, TrackUpdate] = {}
     tentative = known.life.status == TENTATIVE
     for turn in (~tentative, tentative):
         best = _best_for_tag(mixtures, np.flatnonzero(turn), ping, config, layout)
-        if best is not None:
-            track, after = best
-            update = make_track_update(mixtures[track], after, ping, config)
-            updates[track] = update
+        if best is None:
+            continue
+        track, after = best
+        update = make_track_update(mixtures[track], after, ping, config)
+        taken = np.full(len(ping.row), 2 * update.good.sum() > len(update.good))
+        if taken.all() or config.max_tracks == 1:
+            score = known['score'].copy()
             score[track] += float(update.good.sum())
-            if 2 * update.good.sum() >= len(update.good):
-                return Explanation(updates, np.ones(len(ping.row), bool), score)
-    return Explanation(updates, np.zeros(len(ping.row), bool), score)
+            return Explanation({track: update}, taken, score)
+    return Explanation({}, np.zeros(len(ping.row), bool), score)
 
 
 def _best_for_tag(
@@ -471,11 +469,9 @@ def update_by_ping(
         measured = measured._replace(variance=scale[:, None] * measured.variance)
     if ping.passive or ping.pairs > MOST_SUBSETS:
         heavy = measured, find_optima(ping, config), DEGREES, config.outlier_probability
-        x, P, evidence, weights = student_t_ping(x, P, mask, config.target_z, *heavy)
+        x, P, evidence, good = student_t_ping(x, P, mask, config.target_z, *heavy)
         # Jacobian of the scaled residuals.
         evidence = evidence - 0.5 * len(ping.row) * np.log(scale)
-        squared = (DEGREES + 1.0) / np.maximum(weights, 1e-300) - DEGREES
-        good = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
     else:
         subsets = config.outlier_probability, MOST_EXPLANATIONS
         x, P, evidence, good = subset_ping(x, P, mask, config.target_z, measured, *subsets)

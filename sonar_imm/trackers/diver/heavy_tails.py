@@ -46,6 +46,9 @@ from .explanations import (
 DEGREES = 4.0
 """Degrees of freedom of the Student-t density of a residual."""
 
+GOOD_RESIDUAL = 3.0
+"""Residual, in standard deviations, of an arrival that is equally likely an outlier."""
+
 MOST_ITERATIONS = 60
 
 SMALLEST_GAIN = 1e-7
@@ -306,9 +309,10 @@ def student_t_ping(
     :param estimated: (n,) False for what is only considered.
     :param positions: (S, 2) where to start besides the predictions.
     :param outlier_probability: of each measurement to be wild, see `PingMeasurements.density`.
-    :returns: x, P, the log-evidence (L,) up to a constant common to the hypotheses, and the
-        weights (L, C). A hypothesis whose covariance has no root stays as it is, with evidence
-        -inf.
+    :returns: x, P, the log-evidence (L,) up to a constant common to the hypotheses, and the inlier
+        probability (L, C) of each measurement: the mean of those at the places of a hypothesis, so
+        that arrivals which fit different places are not all good. A hypothesis whose covariance
+        has no root stays as it is, with evidence -inf.
     """
 
     def update(x: FloatArray, P: FloatArray, measured: PingMeasurements) -> Updated:
@@ -329,10 +333,10 @@ def _student_t_ping(
     outlier_probability: float,
 ) -> Updated:
     L, C = len(x), len(measured.value)
-    x1, P1, evidence, weights = x.copy(), P.copy(), np.full(L, -np.inf), np.zeros((L, C))
+    x1, P1, evidence, good = x.copy(), P.copy(), np.full(L, -np.inf), np.zeros((L, C))
     prior, known = _prior(x, P, height, measured, degrees, outlier_probability)
     if not len(known):
-        return x1, P1, evidence, weights
+        return x1, P1, evidence, good
     own = np.arange(len(known))
     starts = [_start(prior, own, None)]
     for place in positions:
@@ -362,9 +366,11 @@ def _student_t_ping(
         innovation = residual[c] + (gradient[c] * (there - means)).sum(axis=0)
         noise = wider * variance[c] / weight[c]
         consider_scalar(means, covariances, gradient[c], noise, innovation, estimated)
-    each = means[:, : len(of)], covariances[..., len(of) :], now.weight
-    x1[known], P1[known], evidence[known], weights[known] = combine(of, log, *each)
-    return x1, P1, evidence, weights
+    squared = (degrees + 1.0) / np.maximum(now.weight, 1e-300) - degrees
+    inlier = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
+    each = means[:, : len(of)], covariances[..., len(of) :], inlier
+    x1[known], P1[known], evidence[known], good[known] = combine(of, log, *each)
+    return x1, P1, evidence, good
 
 
 def _without_one(prior: _Prior) -> FloatArray:

@@ -242,6 +242,11 @@ class Scan:
     births: list[Birth] = field(factory=list, init=False)
     """Births from pings."""
 
+    @property
+    def are_tags(self) -> bool:
+        """True for pings of tags alone: each is of one of the targets."""
+        return not self.fixes and all(ping.passive for ping in self.pings)
+
     def number_sensors(self, known: Sensors) -> Sensors:
         """Number the sensors of the scan; arrivals are of the sensor without a name.
 

@@ -6,7 +6,13 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The faults that every node is tried with, and what is promised of each."""
+"""The faults that every node is tried with, and what is promised of each.
+
+A fault is a function of the messages before, during and after it: it gives what is sent instead,
+in two lists, the disturbed part and the rest. `Rig` sends both in lock-step to a node that runs as
+a process and compares what it publishes in the rest with an undisturbed run. To add a fault, write
+that function and a line of the table.
+"""
 
 from collections.abc import Callable, Sequence
 import functools

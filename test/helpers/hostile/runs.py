@@ -34,20 +34,8 @@ from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.recordings.measurements import DetectedImages
 
-from .streams import (
-    clone,
-    IMAGES,
-    is_bool,
-    is_many,
-    is_sequence,
-    leaves,
-    make,
-    number_type,
-    SECOND,
-    stream,
-    templates,
-    VARIANTS,
-)
+from . import streams
+from .streams import make, SECOND, stream
 
 ODD = np.array([
     np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 1.0, 5e-324, 1e-45, 1e-30, 1e-12, 1e-6, 0.5, 3.0,
@@ -63,9 +51,9 @@ TABLE = 'sensor_msgs/msg/PointCloud2'
 
 def odd_field(message, rng):
     """An odd value in any field, however deep."""
-    places = list(leaves(message))
+    places = list(streams.leaves(message))
     owner, name, node = places[rng.integers(len(places))]
-    odd = _odd_many if is_many(node) else _odd_one
+    odd = _odd_many if streams.is_many(node) else _odd_one
     setattr(owner, name, odd(getattr(owner, name), node, rng))
 
 
@@ -127,7 +115,7 @@ MUTATIONS = (odd_field, odd_table, odd_table, odd_layout, claim, odd_stamp, agai
 
 def mutated(message, mutation, rng):
     """A copy of a message, changed once or twice."""
-    message = clone(message)
+    message = streams.clone(message)
     mutation(message, rng)
     if rng.random() < 0.3:
         MUTATIONS[rng.integers(len(MUTATIONS))](message, rng)
@@ -135,10 +123,10 @@ def mutated(message, mutation, rng):
 
 
 def _odd_one(value, node, rng):
-    number = number_type(node)
+    number = streams.number_type(node)
     if number is None:
         return str(rng.choice(TEXTS))
-    if is_bool(node):
+    if node[1][0] == 'bool':
         return bool(rng.integers(2))
     if number.kind == 'f':
         return float(_odd_floats(np.asarray(value, number), rng))
@@ -171,13 +159,13 @@ def _odd_numbers(values, rng):
 
 def _odd_many(value, node, rng):
     if isinstance(value, list):
-        if not is_sequence(node):
+        if not streams.is_sequence(node):
             return value
         if not value or rng.random() < 0.2:
             return []
         picked = rng.integers(len(value), size=int(rng.integers(1, 2 * len(value) + 1)))
-        return [clone(value[i]) for i in picked]
-    if is_sequence(node) and rng.random() < 0.3:
+        return [streams.clone(value[i]) for i in picked]
+    if streams.is_sequence(node) and rng.random() < 0.3:
         length = int(rng.choice([0, 1, max(len(value) - 1, 0), len(value) + 1, 1000]))
         return np.resize(value, length) if len(value) else np.ones(length, value.dtype)
     return _odd_numbers(value, rng)
@@ -350,7 +338,7 @@ class Bad(NamedTuple):
     @classmethod
     def of(cls, system, number):
         """One for each number; a smaller number is no simpler a case, but the same every time."""
-        number, template = divmod(number, len(templates(system)))
+        number, template = divmod(number, len(streams.templates(system)))
         return cls(template, *reversed(divmod(number, len(MUTATIONS))))
 
 
@@ -370,7 +358,8 @@ def batches(system):
     """A strategy: which variant of the tracker, and the bad messages."""
     bad = st.integers(0, 2**40 - 1).map(lambda number: Bad.of(system, number))
     return st.tuples(
-        st.integers(0, len(VARIANTS[system]) - 1), st.lists(bad, min_size=BATCH, max_size=BATCH)
+        st.integers(0, len(streams.VARIANTS[system]) - 1),
+        st.lists(bad, min_size=BATCH, max_size=BATCH),
     )
 
 
@@ -378,7 +367,7 @@ def batches(system):
 def _tracker(system, variant):
     """A warm tracker, what reads for it, and the measurements of its stream."""
     entry = SYSTEMS[system]
-    config = entry.config_type().from_mapping(VARIANTS[system][variant])
+    config = entry.config_type().from_mapping(streams.VARIANTS[system][variant])
     tracker = entry.build(config)
     tracker.warm()
     settings = config.as_dict()
@@ -387,7 +376,7 @@ def _tracker(system, variant):
         for item in inputs_of(system)
         for type_name in item.readers
     }
-    images = DetectedImages(system, IMAGES, settings) if made_inputs(system) else None
+    images = DetectedImages(system, streams.IMAGES, settings) if made_inputs(system) else None
     for each in made_inputs(system):
         for type_name in each.readers:
             readers[each.name, type_name] = images.reader(each, type_name)
@@ -433,7 +422,7 @@ def _run(system, batch, tally):
 def _read(system, bad, readers, stamp_ns, tally):
     """The measurement that a bad message gives, None when it is refused."""
     rng = np.random.default_rng(bad.seed)
-    name, type_name, message = templates(system)[bad.template]
+    name, type_name, message = streams.templates(system)[bad.template]
     message = _at(message, stamp_ns + int(rng.integers(10**8)))
     message = mutated(message, MUTATIONS[bad.mutation], rng)
     if rng.random() < 0.05:  # on another input of the same type

@@ -84,10 +84,6 @@ def is_sequence(node):
     return node[0] == Nodetype.SEQUENCE
 
 
-def is_bool(node):
-    return node[0] == Nodetype.BASE and node[1][0] == 'bool'
-
-
 def _zero(node):
     kind, detail = node
     if kind == Nodetype.NAME:

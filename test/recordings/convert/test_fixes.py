@@ -86,22 +86,19 @@ def test_uncertainty_in_every_form(convert):
 NAN = math.nan
 
 
-@pytest.mark.parametrize(
-    'header, cells, of_z',
-    [
+def test_the_uncertainty_of_z(convert):
+    for k, (header, cells, of_z) in enumerate((
         ('std,depth,std_z', '3,7,0.5', [0, 0, 0.25]), ('z,std_z', '-7,0.5', [NAN, NAN, 0.25]),
         ('std,z,sigma_depth', '3,-7,0.5', [0, 0, 0.25]), ('std,z,std_z', '3,,0.5', [NAN] * 3),
         ('std,z,var_z', '3,-7,0.25', [0, 0, 0.25]), ('std,z,std_z', '3,-7,', [NAN] * 3),
         ('std,z,cov_x_z,cov_y_z,cov_z_z', '3,-7,0.5,-0.25,1', [0.5, -0.25, 1]),
         ('std,z,std_z', '3,-7,-0.5', [NAN] * 3), ('std,z,cov_x_z,var_z', '3,-7,9,1', [NAN] * 3),
-    ],
-)  # fmt: skip
-def test_the_uncertainty_of_z(convert, header, cells, of_z):
-    (fix,) = measured(convert(f'stamp,x,y,{header}\n5,1,2,{cells}\n').path)
-    assert fix.covariance[2] == pytest.approx(of_z, nan_ok=True)
-    rows = ''.join(f'{second},{second},2,A,{cells}\n' for second in (5, 6))
-    scans = measured(convert(f'stamp,x,y,id,{header}\n{rows}', out='named').path)
-    assert scans[0].covariance[0, 2] == pytest.approx(of_z, nan_ok=True)
+    )):  # fmt: skip
+        (fix,) = measured(convert(f'stamp,x,y,{header}\n5,1,2,{cells}\n', out=f'{k}').path)
+        assert fix.covariance[2] == pytest.approx(of_z, nan_ok=True)
+        rows = ''.join(f'{second},{second},2,A,{cells}\n' for second in (5, 6))
+        scans = measured(convert(f'stamp,x,y,id,{header}\n{rows}', out=f'named{k}').path)
+        assert scans[0].covariance[0, 2] == pytest.approx(of_z, nan_ok=True)
 
 
 def test_an_impossible_covariance_is_a_bad_row(convert):
@@ -222,27 +219,22 @@ def test_metres_have_no_parameters_and_the_same_input_gives_the_same_bag(convert
         content('one')
 
 
-ADVICE = [
-    ('x,y\n2024-05-31 10:00:00,1,2', '--truth-time-zone UTC', {'time_zone': 'UTC'}),
-    ('a,b\n5,1,2', '--truth-column x=HEADER', {'columns': {'x': 'a', 'y': 'b'}}),
-    ('Lat,Lon\n5,115.1,-33.5', "--truth-column 'latitude=Lon'",
-     {'columns': {'latitude': 'Lon', 'longitude': 'Lat'}}),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize('truth, words, helps', ADVICE)
-def test_advice_about_the_truth_names_the_options_of_the_truth(
-    convert, tmp_path, truth, words, helps
-):
+def test_advice_about_the_truth_names_the_options_of_the_truth(convert, tmp_path):
     path, text = tmp_path / 'truth.csv', 'time,x,y\n5,1,2\n'
-    path.write_text(f'time,{truth}\n')
-    try:
-        said = ' '.join(convert(text, truth=path).problems)
-    except BagError as error:
-        said = error.sentence
-    assert words in said
-    report = convert(text, out='helped', truth=path, truth_options=CsvOptions(**helps))
-    assert report.messages['/truth/estimate'] == 1 and report.problems == []
+    for k, (truth, words, helps) in enumerate((
+        ('x,y\n2024-05-31 10:00:00,1,2', '--truth-time-zone UTC', {'time_zone': 'UTC'}),
+        ('a,b\n5,1,2', '--truth-column x=HEADER', {'columns': {'x': 'a', 'y': 'b'}}),
+        ('Lat,Lon\n5,115.1,-33.5', "--truth-column 'latitude=Lon'",
+         {'columns': {'latitude': 'Lon', 'longitude': 'Lat'}}),
+    )):  # fmt: skip
+        path.write_text(f'time,{truth}\n')
+        try:
+            said = ' '.join(convert(text, out=f'{k}', truth=path).problems)
+        except BagError as error:
+            said = error.sentence
+        assert words in said
+        report = convert(text, out=f'helped{k}', truth=path, truth_options=CsvOptions(**helps))
+        assert report.messages['/truth/estimate'] == 1 and report.problems == []
 
 
 def test_rows_that_share_a_stamp_are_said(convert):

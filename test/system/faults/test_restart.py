@@ -79,37 +79,32 @@ def killed(case, arguments, path, messages, at_once, rng):
 def test_a_node_that_is_killed_goes_on_with_ids_and_covariances(system, tmp_path, figures):
     figures.skip_if_measured(TURNS, system=system)
     case, rng = CASES[system], np.random.default_rng(4)
-    with Rig(case) as undisturbed:
-        killed_and_started_again(case, rng, tmp_path, figures, undisturbed)
-
-
-def killed_and_started_again(case, rng, tmp_path, figures, undisturbed):
-    system = case.system
     messages = messages_of(case)
     again = round(AGAIN * len(messages))
     given, equal, forgotten, wrong = 0, 0, 0, []
-    whole = final(system, undisturbed.play(messages))
-    for turn in range(TURNS):
-        path = tmp_path / f'state_{turn}'
-        arguments = '-p', f'state_file:={path}'
-        stop, cut = (int(rng.integers(*item)) for item in ((again, len(messages) - 6), (2, 6)))
-        cut += stop
-        first = killed(case, arguments, path, messages[:stop], messages[stop:cut], rng)
-        assert final(system, first).keys() <= whole.keys()
-        with Rig(case, arguments) as rig:
-            log = rig.node.log()
-            second = final(system, rig.play(messages[stop - again + 1 :]))
-            assert rig.node.stop() == 0 and 'Traceback' not in rig.node.log()
-        assert 'goes on from the state' in log, log
-        after = {s: item for s, item in whole.items() if s >= messages[cut].stamp_ns}
-        assert after.keys() <= second.keys() <= whole.keys()
-        given += len(second)
-        good = [same(item, whole[stamp]) for stamp, item in second.items()]
-        equal += sum(good)
-        wrong += [(turn, stop, stamp) for stamp, ok in zip(second, good) if not ok]
-        undisturbed.reset()  # what a node makes of it without the file
-        alone = final(system, undisturbed.play(messages[stop - again + 1 :]))
-        forgotten += sum(not same(alone[stamp], whole[stamp]) for stamp in second)
+    with Rig(case) as undisturbed:
+        whole = final(system, undisturbed.play(messages))
+        for turn in range(TURNS):
+            path = tmp_path / f'state_{turn}'
+            arguments = '-p', f'state_file:={path}'
+            stop, cut = (int(rng.integers(*item)) for item in ((again, len(messages) - 6), (2, 6)))
+            cut += stop
+            first = killed(case, arguments, path, messages[:stop], messages[stop:cut], rng)
+            assert final(system, first).keys() <= whole.keys()
+            with Rig(case, arguments) as rig:
+                log = rig.node.log()
+                second = final(system, rig.play(messages[stop - again + 1 :]))
+                assert rig.node.stop() == 0 and 'Traceback' not in rig.node.log()
+            assert 'goes on from the state' in log, log
+            after = {s: item for s, item in whole.items() if s >= messages[cut].stamp_ns}
+            assert after.keys() <= second.keys() <= whole.keys()
+            given += len(second)
+            good = [same(item, whole[stamp]) for stamp, item in second.items()]
+            equal += sum(good)
+            wrong += [(turn, stop, stamp) for stamp, ok in zip(second, good) if not ok]
+            undisturbed.reset()  # what a node makes of it without the file
+            alone = final(system, undisturbed.play(messages[stop - again + 1 :]))
+            forgotten += sum(not same(alone[stamp], whole[stamp]) for stamp in second)
     figures.add(
         {'system': system}, tried=TURNS, again=again - 1, estimates=given, equal=equal,
         changed_without=forgotten, wrong=wrong,

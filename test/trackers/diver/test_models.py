@@ -261,9 +261,9 @@ def test_many_arrivals_lead_all_hypotheses_to_one_place():
     """From wherever they start: the ping by itself says where the diver is."""
     x, P, measured, truth = hypotheses(6, 12)
     heavy = np.ones(MOTION, bool), -5.0, measured, truth[None, :2] + 5.0, 4.0, 0.02
-    mean, covariance, _, weights = student_t_ping(x, P, *heavy)
+    mean, covariance, _, good = student_t_ping(x, P, *heavy)
     assert np.hypot(*(mean[:, :2] - truth[:2]).T).max() < 1.0
-    assert (weights[:, 2] < 0.1).all()  # the echo that is late
+    assert (good[:, 2] < 0.1).all()  # the echo that is late
     np.testing.assert_array_equal(covariance, np.swapaxes(covariance, 1, 2))
 
 

@@ -24,8 +24,9 @@ from sonar_imm.measurements import ArrayDepth, CrossSpectra
 from sonar_imm.trackers.fathometer import pressure
 from sonar_imm.trackers.fathometer.pressure import CompanionDepths
 from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array
-from sonar_imm.trackers.fathometer.tracker import FathometerConfig
-from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm_tools.simulation.fathometer.scenario import Drift
+from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, scenario, simulate
 
 SMALL = {**scenario('small').instruments(), 'particles': 2000}
 
@@ -285,6 +286,27 @@ def test_negative_layers_are_found_where_they_are_looked_for():
     tracker, found = run(scene.traces(range(30)), particles=2000, polarity='positive')
     assert 'negative echoes' in ' '.join(tracker.warnings())
     assert all((each.extras['polarity'] >= 0).all() for each in found.values())
+
+
+def test_negative_layers_under_an_array_are_found_at_the_defaults():
+    """Six layers, of which two are negative, as cross-spectra; traces keep the plain defaults."""
+    rng, changes = np.random.default_rng(7), {'records': 10, 'snapshots': 100}
+    config = scenario('pressure', {'level': 'csdm', 'snapshot_seconds': 0.35, **changes})
+    depth = np.array([52.0, 55.2, 58.5, 61.7, 66.0, 69.3])
+    depth = depth + np.cumsum(0.05 * rng.standard_normal((10, 6)), axis=0)
+    array = config.array_depth + rng.uniform(-0.5, 0.5, 10)
+    stated = array + config.array_depth_std * rng.standard_normal(10)
+    amplitude = np.tile([0.35, 0.3, -0.25, 0.22, -0.2, 0.15], (10, 1))
+    floor = Drift(depth, amplitude, amplitude != 0.0, array, stated)
+    settings = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
+    settings |= {'depth_min': config.depth_min, 'depth_max': config.depth_max, 'particles': 3000}
+    settings |= {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
+    tracker = FathometerTracker(FathometerConfig(**settings, window='rectangular', overlap=0.0))
+    for record, told in enumerate(stated.tolist()):
+        (found,) = tracker.process(cross_spectra(config, floor, record, told, rng))
+    assert found.state[:, 0] == pytest.approx(depth[-1], abs=0.2)
+    assert np.array_equal(found.extras['polarity'], np.sign(amplitude[-1]))
+    assert tracker.warnings() == []
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from helpers.fathometer_runs import order_of, run
 import numpy as np
 import pytest
 
-from benchmarks import fathometer_gaps as gaps
+from benchmarks import fathometer_sea as gaps
 from msg_adapters.displays.fathometer import Displays
 from msg_adapters.displays.tracks import MODELS
 from sonar_imm.measurements import GeodeticFix

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from benchmarks.fathometer_gaps import scene as gaps_scene
+from benchmarks.fathometer_sea import scene as gaps_scene
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer import datum as datums

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 import pytest
 from scipy.stats import norm
 
-from benchmarks.real_navigation import data_folder, dead_reckoned, summary
+from benchmarks.real_navigation import dead_reckoned, FOLDER, summary
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.navigation import MOST_WAITING
@@ -187,9 +187,9 @@ def test_the_edges_of_the_beam_are_smeared():
 
 
 @pytest.mark.statistics
-@pytest.mark.skipif(not (data_folder() / 'dvl.csv').exists(), reason='no SONAR_IMM_DATA')
+@pytest.mark.skipif(not (FOLDER / 'dvl.csv').exists(), reason='no SONAR_IMM_DATA')
 def test_the_band_holds_the_offset_under_real_motion():
-    found = summary(dead_reckoned(data_folder()), runs=20)
+    found = summary(dead_reckoned(), runs=20)
     assert found['tracked'] == 20 and found['band_coverage'] >= 0.8 and found['nees'] < 2.0
     # It knows more than where obstacles are drawn, and than its own first answer. At 0.2 m/s the
     # drift that it allows for is a tenth of the speed, and costs 7 % of the RMSE.

@@ -8,8 +8,6 @@
 
 """What `sonar-imm convert` costs, by kind of file.
 
-    python -m benchmarks.conversions --out docs/results/conversions.json
-
 Each file is made here by other means than the package has, and converted by the whole command in a
 process of its own, `rounds` times. CPU seconds are the least of them, with the start of the
 command, which is also given alone (`nothing`); they depend little on what else the machine does.
@@ -28,8 +26,6 @@ from typing import Any
 import wave
 
 import numpy as np
-
-from benchmarks.study import Parts, study
 
 BEGIN = 1_750_000_000
 """Seconds since 1970 of the first record."""
@@ -224,14 +220,3 @@ def conversion(name: str, rounds: int) -> dict[str, Any]:
         'records per CPU s': round(records / spent),
         'MB per CPU s': size / spent,
     }
-
-
-def main(rounds: int = 3, cases: Sequence[str] = tuple(CASES)) -> Parts:
-    start = min(cpu_seconds('convert', '--help') for _ in range(rounds))
-    yield {'rounds': rounds, 'start CPU s': start}
-    for name in cases:
-        yield {'conversions': {name: conversion(name, rounds)}}
-
-
-if __name__ == '__main__':
-    study(main, digits=2, cases={'choices': list(CASES)})
