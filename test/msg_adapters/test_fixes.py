@@ -56,8 +56,8 @@ def test_a_pose_and_a_point_are_read():
     assert fix.position.tolist() == [1.0, 2.0, 3.0]
     assert fix.covariance[:2, :2].tolist() == [[4.0, 0.5], [0.5, 9.0]]
     assert np.isnan(fix.covariance[2]).all()
-    place = ros_message('geometry_msgs/msg/Point', x=7.0, y=8.0)
-    point = ros_message('geometry_msgs/msg/PointStamped', header=pose().header, point=place)
+    at = {'header__stamp__sec': 7, 'point__x': 7.0, 'point__y': 8.0}
+    point = driver_message('geometry_msgs/msg/PointStamped', **at)
     assert read_fix(point).position.tolist() == [7.0, 8.0, 0.0]
     assert read_fix(point).covariance is None and adapters.doubt_fix(point) is None
     # What is not used may be nonsense.
@@ -187,14 +187,12 @@ def test_a_covariance_that_says_nothing_is_unknown_and_so_is_a_height():
 
 def test_what_is_no_position_is_refused():
     for changes, expected in (
-        ({'latitude': float('nan')}, 'nan'),
-        ({'latitude': 91.0}, 'out_of_range'),
-        ({'longitude': 361.0}, 'out_of_range'),
-        ({'altitude': 1e9}, 'out_of_range'),
+        ({'latitude': float('nan')}, 'nan'), ({'latitude': 91.0}, 'out_of_range'),
+        ({'longitude': 361.0}, 'out_of_range'), ({'altitude': 1e9}, 'out_of_range'),
         ({'position_covariance': np.diag([1.0, 1e-20, 1.0]).ravel()}, 'bad_covariance'),
         ({'position_covariance': np.ones(9)}, 'bad_covariance'),
         ({'position_covariance': np.ones(4)}, 'bad_shape'),
-    ):
+    ):  # fmt: skip
         assert reason(read_geodetic, navsat(**changes)) == expected
 
 
@@ -272,16 +270,14 @@ def test_a_start_is_read_and_written_also_its_height_and_turned():
 
 X, Y = 'pose__pose__position__x', 'pose__pose__position__y'
 BAD_STARTS = [
-    ('nan', X, [math.nan]),
-    ('nan', Y, [math.inf]),
-    ('out_of_range', X, [2e8]),
+    ('nan', X, [math.nan]), ('nan', Y, [math.inf]), ('out_of_range', X, [2e8]),
     ('no_covariance', 'covariance', [np.zeros((2, 2)), -np.eye(2), [[math.nan, 0.0], [0.0, 1.0]]]),
     ('bad_covariance', 'covariance', [[[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]]),
     ('out_of_range', 'covariance', [np.eye(2) * 1e-20]),
     ('not_measured', 'covariance', [np.eye(2) * 1e20]),
     ('frame_ned', 'header__frame_id', ['map_ned']),
     ('bad_stamp', 'header__stamp', [ros_message('builtin_interfaces/msg/Time')]),
-]
+]  # fmt: skip
 
 
 def test_a_start_that_cannot_be_used_is_refused():

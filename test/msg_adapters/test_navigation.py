@@ -186,17 +186,14 @@ def test_what_is_written_reads_back():
 
 
 def test_what_cannot_be_used_is_refused_with_its_reason():
+    turn, way = 'transform__rotation__', 'transform__translation__'
     for name, value, code in (
-        ('transform__translation__x', math.nan, 'nan'),
-        ('transform__rotation__w', math.inf, 'nan'),
-        ('transform__rotation__w', 7.0, 'out_of_range'),
-        ('transform__rotation__x', 1e300, 'out_of_range'),
-        ('transform__translation__y', 1e9, 'out_of_range'),
-        ('header__frame_id', '', 'no_frame'),
-        ('child_frame_id', 'base_link', 'no_frame'),
-        ('child_frame_id', 'f' * 1001, 'too_large'),
+        (f'{way}x', math.nan, 'nan'), (f'{turn}w', math.inf, 'nan'),
+        (f'{turn}w', 7.0, 'out_of_range'), (f'{turn}x', 1e300, 'out_of_range'),
+        (f'{way}y', 1e9, 'out_of_range'), ('header__frame_id', '', 'no_frame'),
+        ('child_frame_id', 'base_link', 'no_frame'), ('child_frame_id', 'f' * 1001, 'too_large'),
         ('header__frame_id', 'f' * 1001, 'too_large'),
-    ):
+    ):  # fmt: skip
         made = message()
         marine.put(made.transforms[0], **{name: value})
         assert reason(read_transforms, made) == code

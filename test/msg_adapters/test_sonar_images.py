@@ -184,11 +184,8 @@ def test_a_sonar_says_it_of_its_own_images_and_of_what_comes_next():
         tell(**fields)
         assert of_images.process(image).intensity[0] == pytest.approx(strongest)
     known = dict(of_images.infos)  # what cannot be true is refused, and nothing changes
-    for fields in (
-        {'intensity_scale': DECIBEL, 'scale': np.nan},
-        {'intensity_scale': DECIBEL, 'scale': -1.0},
-        {'tx_signal_types': [CW], 'pulse_lengths': [1e3]},
-    ):
+    wrong = [{'intensity_scale': DECIBEL, 'scale': scale} for scale in (np.nan, -1.0)]
+    for fields in (*wrong, {'tx_signal_types': [CW], 'pulse_lengths': [1e3]}):
         assert why(tell, **fields) == 'out_of_range'
     assert of_images.infos == known
     stated = {'scale': 'power', 'gain': 2.0, 'offset': 1.0, 'echo_duration': 2**-10}
@@ -304,10 +301,9 @@ def test_ranges_and_directions_come_from_parameters():
     assert refused(message, **GEOMETRY) == 'bad_stamp'
 
 
-@pytest.mark.parametrize('big', [False, True])
-def test_pixels_of_all_kinds_paddings_and_byte_orders_are_read(big):
+def test_pixels_of_all_kinds_paddings_and_byte_orders_are_read():
     kinds = {'mono8': 'u1', '8UC1': 'u1', 'mono16': 'u2', '32FC1': 'f4', '64FC1': 'f8'}
-    for encoding, dtype in kinds.items():
+    for (encoding, dtype), big in itertools.product(kinds.items(), (False, True)):
         message = photo(encoding=encoding, dtype=dtype, big=big, pad=5)
         np.testing.assert_array_equal(read_sent(message, **GEOMETRY).amplitude, PIXELS)
 

@@ -288,13 +288,10 @@ def test_what_cannot_be_used_is_refused_with_its_reason():
     none = {name: [] for name in ('x', 'y', 'cov_x_x', 'cov_x_y', 'cov_y_y')}
     assert len(read_scan(scan(**none))) == 0  # an empty scan is one
     for code, columns in (
-        ('missing_column', dict.fromkeys(none)),
-        ('missing_column', {'cov_x_y': None}),
-        ('nan', {'x': [math.nan, math.nan]}),
-        ('bad_field', {'x': np.ones((2, 2))}),
-        ('out_of_range', {'id': [0.5, 1.0]}),
-        ('out_of_range', {'id': [3e9, 1.0]}),
-    ):
+        ('missing_column', dict.fromkeys(none)), ('missing_column', {'cov_x_y': None}),
+        ('nan', {'x': [math.nan, math.nan]}), ('bad_field', {'x': np.ones((2, 2))}),
+        ('out_of_range', {'id': [0.5, 1.0]}), ('out_of_range', {'id': [3e9, 1.0]}),
+    ):  # fmt: skip
         assert reason(read_scan, scan(**columns)) == code
 
 
@@ -405,19 +402,15 @@ def test_arrivals_that_cannot_be_used_are_refused_with_their_reason():
     nowhere = {'tx_x': np.array([1.0, np.nan, 2.0]), 'rx_x': np.array([np.nan, 0.0, np.nan])}
     angles = [(name, degrees) for name in ('bearing', 'elevation') for degrees in (45.0, -45.0)]
     for code, changes in (
-        ('empty', {'rows': 0}),
-        ('missing_column', {'rx_y': None}),
-        ('nan', {'toa': np.full(3, np.nan)}),
-        ('nan', nowhere),
+        ('empty', {'rows': 0}), ('missing_column', {'rx_y': None}),
+        ('nan', {'toa': np.full(3, np.nan)}), ('nan', nowhere),
         ('out_of_range', {'rx_id': np.array([0.0, 0.5, 2.0])}),
         ('out_of_range', {'tx_id': np.array([0, -1, 2], np.int32)}),
         ('out_of_range', {'tx_id': np.array([0, 65536, 2], np.int32)}),
         *(('out_of_range', {name: np.array([0.1, value, 0.1])}) for name, value in angles),
-        ('bad_field', {'toa': np.zeros((3, 2))}),
-        ('bad_stamp', {'stamp_ns': 0}),
-        ('frame_ned', {'frame_id': 'map_ned'}),
-        ('too_large', {'rows': 10_001}),
-    ):
+        ('bad_field', {'toa': np.zeros((3, 2))}), ('bad_stamp', {'stamp_ns': 0}),
+        ('frame_ned', {'frame_id': 'map_ned'}), ('too_large', {'rows': 10_001}),
+    ):  # fmt: skip
         assert reason(read_arrivals, message(**changes)) == code
 
 

@@ -9,6 +9,7 @@
 """Every reader with files that are not as they should be: one sentence each, and what can be used
 is kept and counted."""
 
+import re
 import shutil
 
 from helpers.field_files import FORMATS, line
@@ -145,14 +146,11 @@ def test_the_content_says_the_kind(tmp_path):
     for kind, content in FILES:
         path.write_bytes(content)
         assert sniff(path).kind == kind
-    archives = {
-        'snapshots': {'iq': np.zeros((3, 2), complex), 'range': none},
-        'traces': {'depth': none, 'amplitude': none}, '': {'other': none},
-    }  # fmt: skip
-    for kind, arrays in archives.items():
-        np.savez(tmp_path / 'a.npz', **arrays)
-        if kind:
-            assert sniff(tmp_path / 'a.npz').kind == kind
+    np.savez(tmp_path / 'a.npz', iq=np.zeros((3, 2), complex), range=none)
+    assert sniff(tmp_path / 'a.npz').kind == 'snapshots'
+    np.savez(tmp_path / 'a.npz', depth=none, amplitude=none)
+    assert sniff(tmp_path / 'a.npz').kind == 'traces'
+    np.savez(tmp_path / 'a.npz', other=none)
     with pytest.raises(BagError, match='--name iq=ARRAY'):
         sniff(tmp_path / 'a.npz')
 
@@ -177,8 +175,7 @@ def test_a_raw_file_of_an_echo_sounder_says_what_to_do(tmp_path, capsys):
     path.write_bytes((100).to_bytes(4, 'little') + b'XML0' + bytes(100))
     for words in ((), ('ek80',)):
         assert main(['convert', *words, str(path), str(tmp_path / 'bag')]) == 2
-        printed = capsys.readouterr().err.splitlines()
-        (sentence,) = (line for line in printed if 'kind snapshots' in line)
+        (sentence,) = re.findall('.*kind snapshots.*', capsys.readouterr().err)
         assert 'XTF' in sentence and not (tmp_path / 'bag').exists()
 
 
