@@ -29,23 +29,27 @@ RX = np.array(
     ]
 )  # fmt: skip
 TRUTH = np.array([22.0, 31.0])
+KINDS = {'active': [True] * 5, 'passive': [False] * 5, 'mixed': [True, False, True, False, False]}
+COORDINATE = st.floats(-300.0, 300.0)
+POINT = st.tuples(COORDINATE, COORDINATE, st.floats(-40.0, 0.0)).map(np.array)
+PLACE = st.tuples(COORDINATE, COORDINATE).map(np.array)
+quick = settings(max_examples=60, derandomize=True, deadline=None)
+COLUMNS = np.array([0, 1, 3, 5, 7, 8, 9])
+STATE = np.array([31.0, -12.0, 0.7, -9.0, 0.1, 0.6, -0.4, 0.8, 0.003, 4.0])
+DIRECTED = arrivals.PATH, arrivals.ONE_WAY, arrivals.BEARING, arrivals.ELEVATION
 
 
 def problem(active, offset=0.0, bearings=2):
     active = np.array(active)
     tx = np.where(active[:, None], [5.0, -12.0, -3.0], RX)
-    path = multistatic.slant_range(TRUTH, RX, Z)[0] + np.where(
-        active, multistatic.slant_range(TRUTH, tx, Z)[0], offset
-    )
+    sent, path = (multistatic.slant_range(TRUTH, place, Z)[0] for place in (tx, RX))
+    path = path + np.where(active, sent, offset)
     seen = multistatic.bearing(TRUTH, RX[:bearings])
     return ArrivalFit(
         tx=tx, rx=RX, active=active, bearing_rx=RX[:bearings],
         observed=np.concatenate([path, seen]), weight=np.linspace(1.0, 3.0, len(RX) + bearings),
         target_z=Z, max_range=1000.0,
     )  # fmt: skip
-
-
-KINDS = {'active': [True] * 5, 'passive': [False] * 5, 'mixed': [True, False, True, False, False]}
 
 
 @pytest.mark.parametrize('kind', KINDS)
@@ -99,8 +103,7 @@ def test_tag_search_is_never_worse_than_one_begun_at_the_truth(seed):
         target_z=-5.0, max_range=1e4,
     )  # fmt: skip
     found = minimise(fit, fit.starts(fit.weight), fit.weight).distinct()
-    begun = minimise(fit, truth[None], fit.weight)
-    assert found.cost[0] <= 1.001 * begun.cost[0] + 1e-3
+    assert found.cost[0] <= 1.001 * minimise(fit, truth[None], fit.weight).cost[0] + 1e-3
 
 
 def test_runs_that_leave_for_infinity_end():
@@ -120,12 +123,6 @@ def test_each_start_may_have_its_own_weights():
     assert minima.cost.argmin() == 2
     assert_allclose(minima.position[2], TRUTH, atol=1e-3)
     assert minima.cost[[0, 1, 3, 4]].min() > 1.0
-
-
-COORDINATE = st.floats(-300.0, 300.0)
-POINT = st.tuples(COORDINATE, COORDINATE, st.floats(-40.0, 0.0)).map(np.array)
-PLACE = st.tuples(COORDINATE, COORDINATE).map(np.array)
-quick = settings(max_examples=60, derandomize=True, deadline=None)
 
 
 def slope(function, position, step=1e-4):
@@ -181,22 +178,17 @@ def test_coincident_points_give_no_information_and_no_nan(distance):
     assert_allclose(multistatic.range_sum_jacobian(point[0, :2], point, point, -5.0), 0.0)
 
 
-SOUND_SPEED = 1480.0
-
-
 def test_emission_time_and_its_variance_are_those_of_the_joint_estimate():
+    speed = 1480.0
     variance = np.linspace(0.5, 2.0, len(RX)) * 1e-7
     length, direction = multistatic.slant_range(TRUTH, RX, -4.0)
-    known = {'target_z': -4.0, 'sound_speed': SOUND_SPEED}
-    seen = length / SOUND_SPEED + 77.25, variance, RX, TRUTH
+    known = {'target_z': -4.0, 'sound_speed': speed}
+    seen = length / speed + 77.25, variance, RX, TRUTH
     assert multistatic.emission_time(*seen, **known)[0] == pytest.approx(77.25, abs=1e-12)
-    augmented = np.column_stack([direction / SOUND_SPEED, np.ones(len(RX))])
+    augmented = np.column_stack([direction / speed, np.ones(len(RX))])
     joint = np.linalg.inv(augmented.T @ np.diag(1.0 / variance) @ augmented)
     _, stated = multistatic.emission_time(*seen, **known, covariance=joint[:2, :2])
     assert stated == pytest.approx(joint[2, 2], rel=1e-9)
-
-
-# -- paths and angles in three dimensions ---------------------------------------------------------
 
 
 def test_the_paths_of_the_vectors():
@@ -223,18 +215,11 @@ def test_the_angles_of_the_vectors():
     assert_allclose(leg.by_position[0], v['out_jacobian_range'], atol=1e-9)
 
 
-COLUMNS = np.array([0, 1, 3, 5, 7, 8, 9])
-STATE = np.array([31.0, -12.0, 0.7, -9.0, 0.1, 0.6, -0.4, 0.8, 0.003, 4.0])
-
-
 def seen(kind, states, tx, rx, columns=COLUMNS, height=0.0):
     """What one measurement of a kind expects at states (L, n): values (L,), gradients (L, n)."""
     one = np.array([kind]), columns[None], tx[None], rx[None]
     value, gradient = arrivals.observe(np.atleast_2d(states).T, height, *one)
     return value[0], gradient[0].T
-
-
-DIRECTED = arrivals.PATH, arrivals.ONE_WAY, arrivals.BEARING, arrivals.ELEVATION
 
 
 @pytest.mark.parametrize('kind', [*DIRECTED, arrivals.HEIGHT])
@@ -256,7 +241,6 @@ def test_the_form_for_many_states_equals_the_plain_one_and_its_gradient_the_diff
 
 
 def test_measurements_of_all_kinds_at_once_are_those_of_each_kind():
-    """Each with errors of its own receiver, or none."""
     kind = np.array([arrivals.HEIGHT, *DIRECTED, arrivals.PATH])
     rng = np.random.default_rng(5)
     tx, rx = rng.uniform(-80.0, 80.0, (2, 6, 3))

@@ -6,11 +6,13 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Frames, projection, prediction and places against tables made elsewhere and closed forms."""
+"""Frames, projection, prediction, places, soundings and rays: tables made elsewhere, vectors,
+closed forms, their inverse."""
 
 import math
 from pathlib import Path
 
+from helpers.vector_files import load_vectors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -18,14 +20,20 @@ from numpy.testing import assert_allclose
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics import array, geometry, sounding
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.geometry import Pose, rotation
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
+from sonar_imm.acoustics.rays import launch_table, look_up, profile_of, profile_problem, trace
 from sonar_imm.acoustics.relative_position import Mounting, place, Uncertainty
+from sonar_imm.acoustics.sounding import ErrorBudget
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'obstacle'
 EXACT = {'rtol': 0.0, 'atol': 1e-9}
+A, F = 6378137.0, 1.0 / 298.257223563
+E2 = F * (2.0 - F)
+PLACES = [(59.1, 10.2, 0.0), (-33.9, 151.2, 20.0), (0.001, -179.9999, -5.0), (78.2, 15.6, 3.0)]
+SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)
 
 
 def table(name):
@@ -46,10 +54,8 @@ def seen():
 
 def sonar_pose(rows):
     """The sonar in NED, from vehicle pose, lever and mount."""
-    vehicle = Pose(
-        columns(rows, 'nav_n', 'nav_e', 'nav_d'),
-        geometry.rotation(rows['roll'], rows['pitch'], rows['yaw']),
-    )
+    turn = geometry.rotation(rows['roll'], rows['pitch'], rows['yaw'])
+    vehicle = Pose(columns(rows, 'nav_n', 'nav_e', 'nav_d'), turn)
     mount = geometry.rotation(rows['mount_roll'], rows['mount_pitch'], rows['mount_yaw'])
     return geometry.mounted(vehicle, columns(rows, 'lever_x', 'lever_y', 'lever_z'), mount)
 
@@ -81,10 +87,8 @@ def test_sonar_pose_from_vehicle_lever_and_mount(seen):
     due = sonar_pose(seen)
     assert_allclose(due.position, columns(seen, 'sonar_n', 'sonar_e', 'sonar_d'), **EXACT)
     assert_allclose(due.R[:, 2], columns(seen, 'n_x', 'n_y', 'n_z'), **EXACT)
-    vehicle = Pose(
-        columns(seen, 'odom_x', 'odom_y', 'odom_z'),
-        geometry.rotation_of_quaternion(columns(seen, 'qx', 'qy', 'qz', 'qw')),
-    )
+    turn = geometry.rotation_of_quaternion(columns(seen, 'qx', 'qy', 'qz', 'qw'))
+    vehicle = Pose(columns(seen, 'odom_x', 'odom_y', 'odom_z'), turn)
     lever = geometry.flip_body(columns(seen, 'lever_x', 'lever_y', 'lever_z'))
     # In FLU the same mount is turned by roll, -pitch, -yaw.
     mount = geometry.rotation(seen['mount_roll'], -seen['mount_pitch'], -seen['mount_yaw'])
@@ -150,12 +154,6 @@ def test_slerp_against_scipy():
     assert_allclose(np.degrees(on), [0.0, 0.0, 15.0], atol=1e-12)
 
 
-# -- latitude and longitude against the closed form of the ellipsoid, written out here ------------
-
-A, F = 6378137.0, 1.0 / 298.257223563
-E2 = F * (2.0 - F)
-
-
 def earth(latitude, longitude, height):
     """Earth-centred metres: the textbook formula."""
     phi, lam = math.radians(latitude), math.radians(longitude)
@@ -173,9 +171,6 @@ def numeric_axes(latitude, longitude, height=0.0, step=1e-4):
         earth(latitude, longitude, height + 1.0) - there,
     ]
     return np.array([column / np.linalg.norm(column) for column in columns]).T
-
-
-PLACES = [(59.1, 10.2, 0.0), (-33.9, 151.2, 20.0), (0.001, -179.9999, -5.0), (78.2, 15.6, 3.0)]
 
 
 @pytest.mark.parametrize('place', PLACES)
@@ -222,8 +217,6 @@ def test_a_place_without_height_lies_on_the_ellipsoid_and_not_in_the_plane(place
     assert origin.at_height(np.array([3.0, 4.0])).shape == (3,)
     assert np.isnan(origin.at_height(np.array([[1e7, 0.0]]))).all()
 
-
-# -- a relative fix with the vessel's pose against draws of every error ---------------------------
 
 NOTHING = np.zeros((3, 3))
 VESSEL = Pose(np.array([1.0, 2.0, 3.0]), rotation(0.1, -0.05, 0.8))
@@ -321,9 +314,6 @@ def test_jacobian_of_the_attitude():
     assert placed.covariance == pytest.approx((0.25 + 0.0025) * np.eye(3))
 
 
-# -- the polar conversion against quadrature -----------------------------------------------------
-
-
 @pytest.mark.parametrize('variance', [1e-6, 0.01, 0.5])
 def test_moments_equal_quadrature_over_the_truth_given_the_measurement(variance):
     r, angle, var_range = 30.0, 2.3, 4.0
@@ -342,17 +332,11 @@ def test_moments_equal_quadrature_over_the_truth_given_the_measurement(variance)
 
 
 @settings(max_examples=100, derandomize=True, deadline=None)
-@given(
-    r=st.floats(0.0, 1e5),
-    b=st.floats(-10.0, 10.0),
-    sr=st.floats(1e-3, 100.0),
-    sb=st.floats(1e-5, 2.0),
-)
+@given(st.floats(0.0, 1e5), st.floats(-10.0, 10.0), st.floats(1e-3, 100.0), st.floats(1e-5, 2.0))
 def test_covariance_is_positive_definite_and_turns_with_the_scene(r, b, sr, sb):
     position, covariance = unbiased_polar_to_cartesian(r, 0.0, sr**2, sb**2)
-    turn = rotation(0.0, 0.0, b)[:2, :2]
     turned_position, turned = unbiased_polar_to_cartesian(r, b, sr**2, sb**2)
-    scale = np.abs(covariance).max()
+    turn, scale = rotation(0.0, 0.0, b)[:2, :2], np.abs(covariance).max()
     assert (np.diag(covariance) > 0.0).all() and covariance[0, 1] == 0.0
     assert_allclose(turned_position, turn @ position, atol=1e-9 * (1.0 + r))
     assert_allclose(turned, turn @ covariance @ turn.T, atol=1e-12 * scale)
@@ -363,3 +347,206 @@ def test_no_bearing_noise_and_broadcasting():
     assert position.shape == (2, 3, 2) and covariance.shape == (2, 3, 2, 2)
     assert_allclose(position[1, 0], [20.0, 0.0])
     assert_allclose(covariance[1, 0], [[4.0, 0.0], [0.0, 0.0]])
+
+
+def rows():
+    table = load_vectors('bathymetry_sea/pose_table')
+    s_att, s_head, *rest = table.pop('tpu')
+    names = ('attitude', 'heading', 'heave', 'position', 'sound_speed')
+    budget = ErrorBudget(**dict(zip(names, (np.radians(s_att), np.radians(s_head), *rest))))
+    speed = float(table.pop('sound_speed'))
+    for k in range(len(table['p'])):
+        yield {name: values[k] for name, values in table.items()}, budget, speed
+
+
+def look_of(row):
+    side = 'port' if row['side'] == 0 else 'starboard'
+    axes = sounding.array_axes(side, row['tilt'], geometry.rotation(*row['mount']))
+    pose = Pose(row['p'], geometry.rotation_of_quaternion(row['quaternion_xyzw']))
+    return sounding.looks(axes, row['lever'], pose, pose), side
+
+
+def test_the_pose_table():
+    for row, budget, speed in rows():
+        look, side = look_of(row)
+        n = sounding.direction(look, row['u'])
+        point = look.position + row['range'] * n
+        assert look.position == pytest.approx(row['sonar'], abs=1e-9)
+        assert point == pytest.approx(row['point'], abs=1e-6)
+        assert (look.psi, look.C) == pytest.approx((row['psi'], row['C']), abs=1e-6)
+        assert sounding.beam_angle(n, side) == pytest.approx(row['beam_angle'], abs=1e-6)
+        depth, distance = -(point - look.position)[2], np.hypot(*(point - look.position)[:2])
+        found = sounding.uncertainties(row['var_filter'], depth, distance, budget, speed)
+        due = row['vertical_uncertainty'], row['horizontal_uncertainty']
+        assert found == pytest.approx(due, abs=1e-6)
+
+
+def test_height_gives_back_the_direction_sine_also_with_pitch():
+    """C belongs into the formula: without it a pitched array is wrong."""
+    without = []
+    for row, _, _ in rows():
+        look, _ = look_of(row)
+        s = (look.position[2] - row['point'][2]) / (row['range'] * look.C)
+        u = array.direction_sine(s * row['range'], row['range'], look.psi)
+        # Two directions of the fan have one height: the formula gives the one nearer to broadside.
+        if abs(np.arcsin(row['u']) + look.psi) <= 0.5 * np.pi:
+            assert u == pytest.approx(row['u'], abs=1e-9)
+            wrong = array.direction_sine(s * look.C * row['range'], row['range'], look.psi)
+            without.append(abs(wrong - row['u']))
+    assert len(without) > 40 and max(without) > 1e-3
+
+
+def test_attitude_is_that_of_reception_and_position_the_mean():
+    axes, ahead = sounding.array_axes('port', 0.5, np.eye(3)), np.zeros(3)
+    sent = Pose(np.array([0.0, 0.0, 1.0]), np.eye(3))
+    turn = geometry.rotation(np.array([0.0, 0.1]), np.zeros(2), np.zeros(2))
+    received = Pose(np.array([[2.0, 0.0, 1.0], [4.0, 0.0, 3.0]]), turn)
+    look = sounding.looks(axes, np.array([0.0, 0.0, -1.0]), sent, received)
+    assert look.position[0] == pytest.approx([1.0, 0.0, 0.0])
+    assert look.position[1] == pytest.approx([2.0, 0.5 * np.sin(0.1), 1.5 - 0.5 * np.cos(0.1)])
+    # Rolling to starboard lets the starboard array look deeper, and the port one less deep.
+    assert look.psi == pytest.approx([0.5, 0.4])
+    axes = sounding.array_axes('starboard', 0.5, np.eye(3))
+    assert sounding.looks(axes, ahead, sent, received).psi == pytest.approx([0.5, 0.6])
+
+
+def test_the_budget_is_finite_straight_below_and_infinite_where_the_depth_says_nothing():
+    budget = ErrorBudget(attitude=1e-3, heading=1e-3, heave=0.05, position=0.1, sound_speed=0.5)
+    known = np.array([[0.01, 0.01], [15.0, 0.0], [0.0, 50.0]])
+    vertical, horizontal = sounding.uncertainties(*known, budget, 1500.0)
+    assert np.isfinite(horizontal).all() and np.isfinite(vertical[0])
+    assert vertical[1] == np.inf
+
+
+def test_what_the_geometry_leaves_open_is_that_of_the_vectors():
+    case = load_vectors('bathymetry_by_default/array')
+    elevation, depth = np.arcsin(15.0 / case['r']), np.full(len(case['r']), 15.0)
+    known = depth, case['r'] * np.cos(elevation), elevation - np.radians(30.0)
+    tilt, spacing, speed = (np.radians(0.2), 0, 0), (0, 0.01, 0), (0, 0, 2.0 / 1500.0)
+    every = np.add(np.add(tilt, spacing), speed)
+    parts = {'variance': every, 'tilt': tilt, 'spacing': spacing, 'speed': speed}
+    for name, doubt in parts.items():
+        vertical, _ = sounding.geometry_variance(*known, sounding.GeometryDoubt(*doubt))
+        assert vertical == pytest.approx(case[f'common_{name}'], rel=1e-9), name
+
+
+def test_what_the_geometry_leaves_open_is_what_an_error_does():
+    """Seen by an array of another tilt and spacing through water of another speed."""
+    r, down = np.array([20.0, 40.0, 70.0]), np.radians(30.0)
+    elevation = np.arcsin(15.0 / r)
+    known = np.full(3, 15.0), r * np.cos(elevation), elevation - down
+    for tilt, spacing, speed in 1e-6 * np.eye(3):
+        u = np.sin(elevation - down) * (1.0 + spacing + speed)
+        seen, slant = np.arcsin(u) + down + tilt, r * (1.0 + speed)
+        dz, dy = slant * np.sin(seen) - 15.0, slant * np.cos(seen) - r * np.cos(elevation)
+        doubt = sounding.GeometryDoubt(tilt=tilt, spacing=spacing, sound_speed=speed)
+        vertical, horizontal = sounding.geometry_variance(*known, doubt)
+        assert np.sqrt(vertical) == pytest.approx(np.abs(dz), rel=1e-3)
+        assert np.sqrt(horizontal) == pytest.approx(np.abs(dy), rel=1e-3)
+
+
+def cases():
+    case = load_vectors('bathymetry_sea/rays')
+    for number, row in enumerate(case.pop('profile')):
+        chosen = case['profile_id'] == number
+        values = {name: values[chosen] for name, values in case.items()}
+        yield row[np.isfinite(row)].tolist(), values
+
+
+def test_rays_are_those_of_an_independent_integration():
+    for pairs, case in cases():
+        found = trace(profile_of(pairs), case['depth0'], case['launch'], case['time'])
+        assert found.depth == pytest.approx(case['depth'], abs=1e-5)
+        assert found.distance == pytest.approx(case['distance'], abs=1e-5)
+        assert found.elevation == pytest.approx(case['elevation'], abs=1e-5)
+
+
+def test_a_ray_turns_where_the_speed_has_grown_by_its_cosine():
+    # c = 1480 + z: a ray from z = 0 at 5 degrees turns at c = 1480 / cos 5 deg.
+    profile = profile_of([0.0, 1480.0, 200.0, 1680.0])
+    assert profile.at(20.0) == 1500.0
+    times = np.linspace(0.0, 0.2, 2001)
+    depth = trace(profile, 0.0, np.radians(5.0), times).depth
+    assert depth.max() == pytest.approx(1480.0 / np.cos(np.radians(5.0)) - 1480.0, abs=1e-4)
+    circle = trace(profile, 0.0, np.radians(5.0), 0.05)
+    radius = 1480.0 / np.cos(np.radians(5.0))
+    x0 = radius * np.sin(np.radians(5.0))
+    assert np.hypot(circle.distance - x0, circle.depth + 1480.0) == pytest.approx(radius)
+
+
+def test_a_vertical_ray_takes_the_harmonic_mean_speed():
+    time = np.log(1505.0 / 1518.0) / ((1505.0 - 1518.0) / 5.0)
+    down = trace(profile_of(SUMMER), 5.0, 0.5 * np.pi, time)
+    assert (down.depth, down.distance) == (pytest.approx(10.0), pytest.approx(0.0, abs=1e-9))
+    up = trace(profile_of(SUMMER), 10.0, -0.5 * np.pi, time)
+    assert up.depth == pytest.approx(5.0)
+
+
+def test_grazing_rays_end():
+    # Along a speed maximum, a speed minimum and in a layer of constant speed, exactly level.
+    for speeds in ([1480, 1500, 1480], [1500, 1480, 1500], [1500, 1500]):
+        pairs = [value for k, c in enumerate(speeds) for value in (10 * k, c)]
+        found = trace(profile_of(pairs), [0.0, 9.0, 10.0, 20.0], 0.0, 0.5)
+        assert np.isfinite(found.depth).all() and (found.distance > 600.0).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.floats(1400.0, 1600.0), min_size=1, max_size=6),
+    st.floats(-20.0, 80.0),
+    st.floats(-1.57, 1.57),
+    st.floats(0.0, 0.3),
+)
+def test_no_profile_makes_a_ray_faster_than_its_fastest_layer(speeds, depth, launch, time):
+    pairs = [value for k, c in enumerate(speeds) for value in (10.0 * k, c)]
+    found = trace(profile_of(pairs), depth, launch, time)
+    far = np.hypot(found.depth - depth, found.distance)
+    assert np.isfinite(far) and far <= max(speeds) * time * (1.0 + 1e-9) + 1e-9
+
+
+def test_the_launch_table_undoes_the_rays():
+    profile = profile_of(SUMMER)
+    table = launch_table(profile, 5.0, 77.0, 1500.0)
+    straight = launch_table(profile_of([0.0, 1500.0]), 5.0, 77.0, 1500.0)
+    level = np.linspace(-11.0, 29.0, 50)  # also beyond straight down, where it says r sin > r
+    for r, steep in ((17.3, 80.0), (40.0, 50.0), (76.9, 50.0)):
+        launch = np.radians(np.linspace(8.0, steep, 60))
+        depth = trace(profile, 5.0, launch, r / 1500.0).depth - 5.0
+        assert table_at(table, r, depth) == pytest.approx(r * np.sin(launch), abs=0.01)
+        # Of straight rays it is the depth.
+        assert table_at(straight, r, level) == pytest.approx(level, abs=1e-9)
+
+
+def table_at(table, r, depth):
+    row = np.full(len(depth), r / table.range_step)
+    return look_up(table.value, row, table.first_depth, table.depth_step, depth)
+
+
+def test_between_cells_of_the_launch_table_there_is_a_bilinear_function():
+    """In a table that is one there is no error anywhere, also in the second of two rows."""
+    row, column = np.arange(4.0)[:, None], np.arange(6.0)
+    table = 1.0 + 2.0 * row + 0.5 * column - 0.3 * row * column
+    rng = np.random.default_rng(0)
+    rows, columns = rng.uniform(0.0, 3.0, 50), rng.uniform(0.0, 5.0, 50)
+    found = look_up(table, rows, 10.0, 0.25, 10.0 + 0.25 * columns)
+    assert found == pytest.approx(1.0 + 2.0 * rows + 0.5 * columns - 0.3 * rows * columns)
+    outside = look_up(table, np.ones(2), 10.0, 0.25, np.array([9.99, 11.26]))
+    assert np.isnan(outside).all()
+
+
+def test_where_rays_fold_back_nothing_is_heard():
+    # Below a fast layer lies a shadow zone: no direct ray gets there.
+    table = launch_table(profile_of([0.0, 1500.0, 10.0, 1500.0, 12.0, 1600.0]), 5.0, 150.0, 1500.0)
+    row = table.value[140]
+    assert np.isnan(row).any() and np.isfinite(row[-40:]).all()
+
+
+@pytest.mark.parametrize('pairs, word', [
+    ([], 'in turn'), ([0.0, 1500.0, 5.0], 'in turn'),
+    ([5.0, 1500.0, 5.0, 1501.0], 'increasing'), ([0.0, 150.0], 'between'),
+    ([float('nan'), 1500.0, 5.0, 1500.0], 'increasing'), ([0.0, float('nan')], 'between'),
+])  # fmt: skip
+def test_lists_that_are_no_profile_are_refused_by_one_sentence(pairs, word):
+    assert word in profile_problem(pairs)
+    with pytest.raises(ValueError, match=word):
+        profile_of(pairs)

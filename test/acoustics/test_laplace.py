@@ -11,8 +11,7 @@
 import math
 
 import numpy as np
-from oracles.array_likelihood import interfered_log_likelihood, log_likelihood
-from oracles.bin_likelihood import log_densities, log_likelihoods
+from oracles import bin_likelihood as oracle
 import pytest
 from scipy.integrate import quad
 from scipy.special import kve
@@ -20,6 +19,11 @@ from scipy.special import kve
 from sonar_imm.acoustics import array, coherence, interference, laplace
 
 STEP = array.phase_step(0.5)
+TILT = math.radians(30.0)
+STAVES, SPACING = 8, 0.5
+SINES = np.array([[0.3, -0.2], [0.1, np.nan], [0.5, 0.55]])
+VARIANCES = np.array([[5.0, 2.0], [3.0, 3.0], [0.0, 4.0]])
+NOISE = np.array([1.0, 0.5, 2.0])
 
 
 def circular(rng, *shape):
@@ -37,9 +41,8 @@ def test_the_law_is_the_mixture_it_is_derived_from(staves, q):
         return math.exp(-z - q / z - staves * math.log(z) - height)
 
     total = quad(mixture, 0.0, peak)[0] + quad(mixture, peak, np.inf, limit=200)[0]
-    assert laplace.log_density(q, staves) + math.log(2.0) == pytest.approx(
-        math.log(total) + height, abs=1e-6
-    )
+    found = laplace.log_density(q, staves) + math.log(2.0)
+    assert found == pytest.approx(math.log(total) + height, abs=1e-6)
 
 
 def test_where_the_bessel_function_overflows_the_law_is_its_integral_still():
@@ -88,8 +91,9 @@ def test_extreme_values_stay_finite_and_ordered_and_the_slope_is_the_derivative(
 @pytest.mark.parametrize('staves', [2, 8, 64])
 def test_the_table_is_the_likelihood(staves):
     q = np.geomspace(2.0**-20, 2.0**49.99, 20_000)
-    assert np.allclose(log_densities(q, laplace.likelihood_table(staves, 'gaussian')), -q, 1e-12)
-    out, root = log_densities(q, laplace.likelihood_table(staves)), np.sqrt(q)
+    gaussian = laplace.likelihood_table(staves, 'gaussian')
+    assert np.allclose(oracle.log_densities(q, gaussian), -q, 1e-12)
+    out, root = oracle.log_densities(q, laplace.likelihood_table(staves)), np.sqrt(q)
     exact = np.log(kve(staves - 1, 2 * root)) - 2 * root + (1 - staves) * np.log(root)
     error = np.abs(out - exact) / np.maximum(1.0, np.abs(exact))
     finite = np.isfinite(exact)  # the Bessel function overflows in the first cells of many staves
@@ -98,7 +102,7 @@ def test_the_table_is_the_likelihood(staves):
 
 def test_what_the_table_does_not_reach_is_held_at_its_end():
     table = laplace.likelihood_table(8)
-    out = log_densities(np.array([0.0, -1.0, 1e-30, np.nan, 1e300]), table)
+    out = oracle.log_densities(np.array([0.0, -1.0, 1e-30, np.nan, 1e300]), table)
     assert (out[:4] == out[0]).all() and np.isfinite(out).all() and out[4] < -1e7
     for staves, likelihood in ((1, 'laplace'), (65, 'laplace'), (8, 'cauchy')):
         with pytest.raises(ValueError):
@@ -112,17 +116,14 @@ def test_the_likelihood_by_its_parts_is_that_of_the_definition(staves, spacing, 
     rng = np.random.default_rng(2)
     u = np.append(rng.uniform(-1.0, 1.0, 300), [np.nan, 1.0, -1.0])
     y, signal, noise = 3.0 * circular(rng, staves), 40.0, 0.7
-    out = log_likelihoods(
+    out = oracle.log_likelihoods(
         u, spacing, laplace.form_coefficients(y, signal, noise), 0.0, np.empty(0, complex), 0.0,
         laplace.likelihood_table(staves, likelihood),
     )  # fmt: skip
-    expected = log_likelihood(u, y, signal, noise, 2.0 * math.pi * spacing, likelihood)
+    expected = oracle.log_likelihood(u, y, signal, noise, 2.0 * math.pi * spacing, likelihood)
     assert out[300] == expected[300] == -np.inf
     fine = np.arange(len(u)) != 300
     assert np.allclose(out[fine], expected[fine], rtol=3e-7, atol=1e-6)
-
-
-TILT = math.radians(30.0)
 
 
 @pytest.mark.parametrize('tilt', [-0.4, TILT, 1.2])
@@ -182,14 +183,6 @@ def test_the_grid_covers_all_that_can_be_told_apart():
         assert np.diff(grid).max() <= 1.0 / (8 * staves * spacing) + 1e-12
 
 
-# -- beside interferers ---------------------------------------------------------------------------
-
-STAVES, SPACING = 8, 0.5
-SINES = np.array([[0.3, -0.2], [0.1, np.nan], [0.5, 0.55]])
-VARIANCES = np.array([[5.0, 2.0], [3.0, 3.0], [0.0, 4.0]])
-NOISE = np.array([1.0, 0.5, 2.0])
-
-
 @pytest.fixture
 def scene():
     y = circular(np.random.default_rng(0), 3, STAVES)
@@ -214,11 +207,12 @@ def test_the_likelihood_by_its_parts_is_that_of_linear_algebra(scene, likelihood
     form = interference.interference_form(y, covariance)
     u, signal = np.append(np.linspace(-1.0, 1.0, 41), np.nan), 7.0
     for n in range(3):
-        out = log_likelihoods(
+        out = oracle.log_likelihoods(
             u, SPACING, -signal * form.beam[n], form.base[n], form.spread[n], signal,
             laplace.likelihood_table(STAVES, likelihood),
         )  # fmt: skip
-        expected = interfered_log_likelihood(u, y[n], signal, covariance[n], STEP, likelihood)
+        known = u, y[n], signal, covariance[n], STEP, likelihood
+        expected = oracle.interfered_log_likelihood(*known)
         assert out[-1] == expected[-1] == -np.inf
         assert np.allclose(out[:-1], expected[:-1], rtol=3e-7, atol=1e-6)
 
@@ -289,10 +283,8 @@ def test_a_shadow_is_silent_and_an_echo_is_not():
 def test_for_two_staves_the_mean_decides():
     iq = circular(np.random.default_rng(5), 3000, 2)
     wave = 20.0 * circular(np.random.default_rng(6), 3000, 1) * array.steering(0.3, 2, 0.5)
-    silent, heard = (
-        coherence.silent_bins(coherence.coherence(each, 0.5)[0], 2).mean()
-        for each in (iq, iq + wave)
-    )
+    gammas = (coherence.coherence(each, 0.5)[0] for each in (iq, iq + wave))
+    silent, heard = (coherence.silent_bins(gamma, 2).mean() for gamma in gammas)
     assert silent > 0.99 and heard < 0.3
 
 

@@ -136,7 +136,6 @@ def test_the_chain_is_forward_backward():
 
 
 def test_objects_are_caught_and_a_flat_floor_is_kept(pings):
-    """And what is said of them is what the prototype says."""
     caught = single = lost = seen = 0
     names = ('iq', 'power', 'h', 'kind', 'existence_chain')
     for iq, power, h, kind, chain in zip(*(pings[name] for name in names)):
@@ -285,7 +284,6 @@ def test_errors_are_what_is_attainable(paper_pings, method):
 
 ROOT = Path(__file__).resolve().parents[2]
 PING = Path(os.environ.get('SONAR_IMM_DATA', ROOT / '../shared/data')) / 'crimac_ek80/ping.npz'
-
 recorded = pytest.mark.skipif(
     not PING.exists(),
     reason='the recording crimac_ek80 is not here: set SONAR_IMM_DATA to the folder that holds it',

@@ -391,7 +391,6 @@ def test_the_distance_from_a_fix_needs_no_inverse():
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get('SONAR_IMM_DATA', ROOT / '../shared/data')) / 'yaps_ssu1'
 SIGMA_TOA, RECORDED_SPEED, TAG_Z = 0.9e-3, 1545.0, -1.0
-
 recorded = pytest.mark.skipif(
     not (DATA / 'arrivals.csv').exists(),
     reason='the recording yaps_ssu1 is not here: set SONAR_IMM_DATA to the folder that holds it',

@@ -28,6 +28,8 @@ from sonar_imm.estimation.linked_rows import linked_marginals, MOST_CLASSES
 from sonar_imm.estimation.marginals import clusters, log_total, marginals
 
 RULES = association.TrackRules(confirm_hits=3, confirm_window=5, delete_misses=2, max_coast_ns=100)
+POINTS = np.array([[0.0, 0.0], [10.0, 0.0]])
+NOTHING = np.empty((0, 2))
 
 
 def test_gates_and_bounds_are_quantiles():
@@ -229,35 +231,17 @@ def test_coverage_by_hand():
     assert np.isnan(consistency.interval_coverage(np.empty(0), np.empty(0), np.empty(0)))
 
 
-POINTS = np.array([[0.0, 0.0], [10.0, 0.0]])
-NOTHING = np.empty((0, 2))
-
-
-@pytest.mark.parametrize(
-    'truth, estimate, expected',
-    [
-        (POINTS, POINTS, (0.0, 0.0, 0.0)),
-        (POINTS, POINTS[::-1] + [0.0, 1.0], (2.0, 0.0, 0.0)),
-        (POINTS, POINTS[:1], (0.0, 8.0, 0.0)),
-        (POINTS[:1], POINTS, (0.0, 0.0, 8.0)),
-        (POINTS[:1], POINTS[1:], (0.0, 8.0, 8.0)),
-        (NOTHING, POINTS, (0.0, 0.0, 16.0)),
-        (POINTS, NOTHING, (0.0, 16.0, 0.0)),
-        (NOTHING, NOTHING, (0.0, 0.0, 0.0)),
-    ],
-)
+@pytest.mark.parametrize('truth, estimate, expected', [
+    (POINTS, POINTS, (0.0, 0.0, 0.0)),
+    (POINTS, POINTS[::-1] + [0.0, 1.0], (2.0, 0.0, 0.0)), (POINTS, POINTS[:1], (0.0, 8.0, 0.0)),
+    (POINTS[:1], POINTS, (0.0, 0.0, 8.0)), (POINTS[:1], POINTS[1:], (0.0, 8.0, 8.0)),
+    (NOTHING, POINTS, (0.0, 0.0, 16.0)), (POINTS, NOTHING, (0.0, 16.0, 0.0)),
+    (NOTHING, NOTHING, (0.0, 0.0, 0.0)),
+])  # fmt: skip
 def test_gospa_parts_by_hand(truth, estimate, expected):
     result = consistency.gospa(truth, estimate, cutoff=4.0, order=2.0)
     assert (result.localisation, result.missed, result.false) == pytest.approx(expected, abs=1e-12)
     assert result.distance == pytest.approx(np.sqrt(sum(expected)), abs=1e-12)
-
-
-def test_ospa_by_hand():
-    for truth, estimate, due in (
-        (POINTS, POINTS[:1], np.sqrt(8.0)), (POINTS, POINTS + [0.0, 1.0], 1.0),
-        (NOTHING, NOTHING, 0.0), (NOTHING, POINTS, 4.0),
-    ):  # fmt: skip
-        assert consistency.ospa(truth, estimate, cutoff=4.0) == pytest.approx(due, rel=1e-12)
 
 
 def over_matchings(truth, estimate, c, p):
@@ -289,17 +273,12 @@ def test_gospa_says_who_is_whom_and_refuses_nonsense():
             consistency.gospa(POINTS, POINTS, *arguments)
 
 
-@pytest.mark.parametrize(
-    'ids, switches',
-    [
-        ([[1, 2], [1, 2], [1, 2]], [0, 0, 0]),
-        ([[1, 2], [2, 1]], [0, 2]),
-        ([[1, 2], [-1, 2], [1, 2]], [0, 0, 0]),
-        ([[1, 5], [-1, 5], [2, 5], [2, 6], [1, -1]], [0, 0, 1, 1, 1]),
-        ([[-1, -1]], [0]),
-        (np.empty((0, 2)), []),
-    ],
-)
+@pytest.mark.parametrize('ids, switches', [
+    ([[1, 2], [1, 2], [1, 2]], [0, 0, 0]), ([[1, 2], [2, 1]], [0, 2]),
+    ([[1, 2], [-1, 2], [1, 2]], [0, 0, 0]),
+    ([[1, 5], [-1, 5], [2, 5], [2, 6], [1, -1]], [0, 0, 1, 1, 1]), ([[-1, -1]], [0]),
+    (np.empty((0, 2)), []),
+])  # fmt: skip
 def test_a_switch_counts_at_the_scan_where_the_other_track_appears(ids, switches):
     assert consistency.switches_by_scan(np.array(ids, int)).tolist() == switches
     assert consistency.identity_switches(np.array(ids, int)) == sum(switches)
@@ -310,9 +289,6 @@ def test_switching_gospa_is_the_root_mean_square_with_a_penalty_for_each_switch(
     assert consistency.switching_gospa(distance, switches * 0, 5.0) == pytest.approx(np.sqrt(12.5))
     assert consistency.switching_gospa(distance, switches, 5.0) == pytest.approx(np.sqrt(37.5))
     assert np.isnan(consistency.switching_gospa(np.empty(0), np.empty(0, int), 5.0))
-
-
-# -- mean NIS of a memory, against closed forms and random numbers --------------------------------
 
 
 def test_the_memory_is_a_weighted_mean():
@@ -352,9 +328,6 @@ def test_true_words_are_believed_and_wrong_ones_are_not(factor, verdict):
     assert bool(said) == bool(verdict)
     if verdict:
         assert f'echoes miss by {"more" if verdict > 0 else "less"} than stated' in said[0]
-
-
-# -- probabilities of association against all joint events ---------------------------------------
 
 
 def events(possible):
@@ -432,7 +405,6 @@ def test_a_cluster_that_is_too_large_is_solved_by_propagation(monkeypatch, reach
 
 @given(st.integers(0, 2**32 - 1))
 def test_clusters_are_connected_components(seed):
-
     rng = np.random.default_rng(seed)
     T, D = rng.integers(1, 12), rng.integers(0, 12)
     possible = rng.uniform(size=(T, D)) < 0.15
@@ -496,9 +468,6 @@ def test_more_links_than_classes_leave_out_the_lightest():
     used = found.pair.sum(axis=1) + found.none
     assert np.isfinite(used).all() and (used[2 * T :] == 0.0).any() and (used[2 * T :] > 0.0).any()
     assert (found.pair.sum(axis=0) <= 1.0 + 1e-12).all()
-
-
-# -- existence: joint integrated probabilistic data association -----------------------------------
 
 
 def existence_enumerated(ratio, existence, pd):

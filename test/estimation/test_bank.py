@@ -72,7 +72,6 @@ def test_rows_do_not_influence_each_other_and_moments_are_about_the_row():
 
 
 def test_states_behind_the_motion_are_mixed_by_identity():
-    """A constant that is the same in all models stays as it is."""
     rng = np.random.default_rng(2)
     more = []
     for block in given_blocks():
@@ -174,7 +173,6 @@ def test_the_update_is_that_of_the_prototype():
 
 
 def test_a_measured_value_may_be_a_sum_of_components():
-    """Position and a lasting error of the fix, against H as a matrix."""
     x, P, _, rng = one_block(8, N=1, n=5)
     z, R = rng.normal(size=(1, 2)), np.tile(np.eye(2), (1, 1, 1))
     H = np.array([[1.0, 0, 0, 1.0, 0], [0, 1.0, 0, 0, 1.0]])

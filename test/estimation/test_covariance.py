@@ -144,7 +144,6 @@ def ill_conditioned(rng, count, n, m):
 
 @pytest.mark.parametrize(('n', 'm', 'seed'), [(2, 1, 0), (4, 2, 2)])
 def test_ill_conditioned_cases_stay_positive_definite(n, m, seed):
-    """Hundreds of each size, ten steps of the same measurement each."""
     count, repairs = 400, 0
     P, F, Q, H, R = ill_conditioned(np.random.default_rng(seed), count, n, m)
     x, v, B = np.zeros((1, count, n)), np.zeros((1, count, m)), np.zeros((count, n))
@@ -238,7 +237,6 @@ def test_models_that_are_sharp_and_far_apart_mix():
 
 
 def test_a_lift_adds_no_more_than_it_must():
-    """Ordinary covariances keep their bits."""
     P = random_covariance(np.random.default_rng(6), 50, 4)
     P = 0.5 * (P + np.swapaxes(P, -1, -2))
     P[0] = np.diag([1.0, 0.0, 2.0, 3.0])  # nothing to lift where there is no variance
@@ -412,9 +410,6 @@ def test_covariances_stay_symmetric_and_positive_over_many_updates():
         P += 0.01 * np.diag(mask)
         x, P = consider_update(x, P, rng.normal(size=(1, n)), np.eye(1), np.ones(1), mask)
     assert (P == P.T).all() and np.linalg.eigvalsh(P).min() > 0.0
-
-
-# -- the oracles of robust updates: all inlier/outlier subsets, and heavy tails -------------------
 
 
 def test_the_subsets_of_the_vectors():

@@ -18,6 +18,10 @@ import pytest
 from sonar_imm.estimation.history import ReplayHistory, StampGate
 
 S = 1_000_000_000
+HUNDRED, NEXT, THOUSAND = [*range(100, 200)], [*range(200, 300)], [*range(1000, 2000)]
+OUTAGE = *HUNDRED, 260, *range(200, 260), *range(261, 300)
+BEYOND = [*range(5 * 10**9 - 50, 5 * 10**9)]
+LATE = [*range(1000, 1050)]
 
 
 def chain(state, stamp_ns, items):
@@ -80,7 +84,6 @@ def test_states_are_bounded_and_any_order_gives_the_same(stamps, limit):
     st.lists(st.tuples(st.integers(0, 60), st.binary(max_size=1)), max_size=40), st.integers(0, 12)
 )
 def test_any_order_equals_the_accepted_items_sorted(arrivals, window):
-    """Even when some are too late, the answer is that of the accepted ones alone, in order."""
     history = ReplayHistory(b'', window)
     final, verdicts = run(history, arrivals)
     used = [arrival for arrival, verdict in zip(arrivals, verdicts) if verdict == 'used']
@@ -125,9 +128,6 @@ def test_a_step_that_raises_leaves_the_history_as_it_was():
     assert revised[-1][1] == sorted_truth([(1, b'a'), (3, b'c'), (5, b'b')])[5]
 
 
-# -- the stamp gate --------------------------------------------------------------------------
-
-
 def gate(restart_after=3):
     return StampGate(window_ns=10 * S, max_gap_ns=100 * S, restart_after=restart_after)
 
@@ -136,26 +136,20 @@ def decide(stamp_gate, *seconds):
     return [stamp_gate.decide(int(s * S), s) for s in seconds]
 
 
-VERDICTS = {'u': 'use', 'l': 'too_late', 'd': 'doubtful'}
-
-
-@pytest.mark.parametrize(
-    'arrivals, verdicts, abandoned',
-    [
-        ([1000, 1010, 1000, 1110, 1100], 'uuuuu', 0),  # late by no more than the window
-        ([1000, 989.999], 'ul', 0),
-        ([1000, 1001, 9_000_000, 1002, 1003], 'uuduu', 1),
-        ([1000, 9_000_000, 5, 8_000_000, 600, 7_000_000, 1001], 'udldldu', 3),  # no two agree
-        ([s for i in range(20) for s in (1000 + i, 5 + i)], 20 * 'ul', 0),  # good ones between
-        ([1000, *[9_000_000] * 50, 1001], 'u' + 50 * 'd' + 'u', 50),  # a scan of many items
-    ],
-)
+@pytest.mark.parametrize('arrivals, verdicts, abandoned', [
+    ([1000, 1010, 1000, 1110, 1100], 'uuuuu', 0),  # late by no more than the window
+    ([1000, 989.999], 'ul', 0),
+    ([1000, 1001, 9_000_000, 1002, 1003], 'uuduu', 1),
+    ([1000, 9_000_000, 5, 8_000_000, 600, 7_000_000, 1001], 'udldldu', 3),  # no two agree
+    ([s for i in range(20) for s in (1000 + i, 5 + i)], 20 * 'ul', 0),  # good ones between
+    ([1000, *[9_000_000] * 50, 1001], 'u' + 50 * 'd' + 'u', 50),  # a scan of many items
+])  # fmt: skip
 def test_stamps_that_are_off_restart_nothing(arrivals, verdicts, abandoned):
+    words = {'u': 'use', 'l': 'too_late', 'd': 'doubtful'}
     decisions = decide(gate(), *arrivals)
-    assert [d.verdict for d in decisions] == [VERDICTS[letter] for letter in verdicts]
-    assert [d.released for d in decisions if d.verdict == 'use'] == [
-        (s,) for s, letter in zip(arrivals, verdicts) if letter == 'u'
-    ]
+    assert [d.verdict for d in decisions] == [words[letter] for letter in verdicts]
+    used = [(s,) for s, letter in zip(arrivals, verdicts) if letter == 'u']
+    assert [d.released for d in decisions if d.verdict == 'use'] == used
     assert sum(d.abandoned for d in decisions) == abandoned
 
 
@@ -208,17 +202,6 @@ def test_a_looped_recording_restarts_each_time_and_loses_nothing(length, lossy):
     assert released(decisions) == arrivals.tolist()
 
 
-HUNDRED, NEXT, THOUSAND = [*range(100, 200)], [*range(200, 300)], [*range(1000, 2000)]
-OUTAGE = *HUNDRED, 260, *range(200, 260), *range(261, 300)
-BEYOND = [*range(5 * 10**9 - 50, 5 * 10**9)]
-LATE = [*range(1000, 1050)]
-
-
-def inside(rate):
-    """A clock that is set back by 250 s, told `rate` times a second."""
-    return [s + i / rate for s, n in ((1000, 500), (1250, 200)) for i in range(n * rate)]
-
-
 def restarts_at(after, arrivals, at, due=None, window=10, gap=600):
     """The restarts are at `at`, and `due` is released; None: everything."""
     decisions = decide(StampGate(window * S, gap * S, after), *arrivals)
@@ -237,7 +220,8 @@ def test_what_is_late_what_is_a_restart_and_what_comes_of_it():
     for back in (350, 3600, 10**9):  # one set back beyond any lateness is believed at once
         assert restarts_at(5, BEYOND + [5 * 10**9 - back + i for i in range(10)], [54])
     for rate, n in ((1, 100), (10, 102)):  # one set back inside the stream, after a long run
-        assert restarts_at(5, inside(rate), [500 * rate + n - 1])
+        stamps = [s + i / rate for s, k in ((1000, 500), (1250, 200)) for i in range(k * rate)]
+        assert restarts_at(5, stamps, [500 * rate + n - 1])
     for ahead in (20, 100, 299):  # an outlying first stamp inside the gap is outvoted
         assert restarts_at(5, [1000 + ahead, *LATE], [5], window=5)
     # A stray stamp puts off a restart: the run begins again after it.

@@ -33,7 +33,10 @@ from sonar_imm.estimation.adaptation import AdaptiveChain
 from sonar_imm.estimation.markov import RateChain
 from sonar_imm.estimation.motion import Joint, Model, Motion, turning, white_acceleration
 
-CASES = ['A2_cv_ct', 'A12_speedstate16_hover', 'A13_ref_only_missed', 'A14_ref_only_EM_N0_1']
+CASES = 'A2_cv_ct A12_speedstate16_hover A13_ref_only_missed A14_ref_only_EM_N0_1'
+T = np.array([[0.95, 0.05], [0.2, 0.8]])  # asymmetric: a transposed matrix would show
+START = {'mean': [50.0, 10.0, 0.5, 1.0], 'covariance': np.diag([9.0, 9.0, 1.0, 1.0])}
+MODELS = [cv(noise=0.05), ct(noise=0.2, turn_rate=0.15)]
 
 
 class Bank:
@@ -119,7 +122,7 @@ def run_case(known):
     return [np.stack(column) for column in zip(*rows)]
 
 
-@pytest.mark.parametrize('case', CASES)
+@pytest.mark.parametrize('case', CASES.split())
 def test_matches_the_independent_reference(case):
     arrays = load_vectors('diver/imm_reference').items()
     known = {key.split('/')[1]: value for key, value in arrays if key.split('/')[0] == case}
@@ -158,18 +161,12 @@ def random_bank(rng, T=3, M=4, n=3, m=2):
         return A @ np.swapaxes(A, -1, -2) + 0.1 * np.eye(shape[-1])
 
     return {
-        'x': rng.normal(size=(T, M, n)) * 3.0,
-        'P': spd(T, M, n),
-        'mu': rng.dirichlet(np.ones(M), T),
-        'transition': rng.dirichlet(np.ones(M), (T, M)),
-        'F': rng.normal(size=(M, n, n)),
-        'Q': spd(M, n),
-        'B': rng.normal(size=(M, n)),
-        'H': rng.normal(size=(1, M, m, n)),
-        'R': spd(T, m),
-        'innovation': rng.normal(size=(T, M, m)) * 2.0,
+        'x': rng.normal(size=(T, M, n)) * 3.0, 'P': spd(T, M, n), 'R': spd(T, m),
+        'mu': rng.dirichlet(np.ones(M), T), 'innovation': rng.normal(size=(T, M, m)) * 2.0,
+        'transition': rng.dirichlet(np.ones(M), (T, M)), 'F': rng.normal(size=(M, n, n)),
+        'Q': spd(M, n), 'B': rng.normal(size=(M, n)), 'H': rng.normal(size=(1, M, m, n)),
         'E': rng.normal(size=(M, 4, n)),
-    }
+    }  # fmt: skip
 
 
 @settings(deadline=None, max_examples=40)
@@ -302,13 +299,6 @@ def test_the_gate_is_that_of_single_pairs_and_a_sharp_turn_is_inside():
         assert imm.gate(*known, np.full((T, 2), 0.5), *seen, 9.0).shape == (T, D)
 
 
-# -- the ready filter ----------------------------------------------------------------------------
-
-T = np.array([[0.95, 0.05], [0.2, 0.8]])  # asymmetric: a transposed matrix would show
-START = {'mean': [50.0, 10.0, 0.5, 1.0], 'covariance': np.diag([9.0, 9.0, 1.0, 1.0])}
-MODELS = [cv(noise=0.05), ct(noise=0.2, turn_rate=0.15)]
-
-
 def walk(steps=60):
     """Positions (steps, 2) of a walker who turns half way, with the state after each."""
     x, truth = np.array(START['mean']), []
@@ -319,7 +309,7 @@ def walk(steps=60):
     return np.array(truth)[:, :2] + noise, np.array(truth)
 
 
-def filterpy_imm():
+def test_equals_filterpy_on_an_asymmetric_chain():
     filters = []
     for rate, noise in ((0.0, 0.05), (0.15, 0.2)):
         kf = KalmanFilter(dim_x=4, dim_z=2)
@@ -327,11 +317,8 @@ def filterpy_imm():
         kf.F, kf.Q = turning(rate, 1.0), white_acceleration(noise**2, rate, 1.0)
         kf.H, kf.R = np.eye(2, 4), np.eye(2)
         filters.append(kf)
-    return IMMEstimator(filters, np.array([0.5, 0.5]), T)
-
-
-def test_equals_filterpy_on_an_asymmetric_chain():
-    imm, peer = IMM(MODELS, T, **START, measurement=position(1.0)), filterpy_imm()
+    peer = IMMEstimator(filters, np.array([0.5, 0.5]), T)
+    imm = IMM(MODELS, T, **START, measurement=position(1.0))
     for z in walk()[0]:
         imm.step(z)
         peer.predict()
@@ -427,7 +414,6 @@ def test_late_measurements_give_the_bits_of_sorted_ones():
 
 
 def test_ten_short_steps_without_measurement_are_a_long_one():
-    """Of a linear model that is alone, and of the chain."""
     models = [cv(noise=0.3), cv(noise=0.3, name='same')]
     long, short = (IMM(models, T, **START) for _ in range(2))
     long.step(None)
@@ -473,7 +459,6 @@ def test_constant_acceleration_composes():
 
 
 def test_unequal_states_are_mixed_by_their_components():
-    """Standing, straight, turning at an unknown rate: 2, 4 and 5 components."""
     models, chain = [hover(noise=0.05), cv(noise=0.02), ct(noise=0.02)], 0.02 + 0.94 * np.eye(3)
     start = [50.0, 10.0, 0.0, 0.0, 0.0], np.diag([9.0, 9.0, 1.0, 1.0, 0.04])
     imm = IMM(models, chain, *start, position(0.2))
@@ -514,19 +499,15 @@ def test_a_model_with_outputs_of_its_own_is_the_same_model():
     assert imm.model_probabilities[0] > 0.99
 
 
-@pytest.mark.parametrize(
-    'values, problem',
-    [
-        ({'mean': [0.0, 0.0]}, 'mean and covariance need 4 and 4 x 4 values, for px, py, vx, vy'),
-        ({'covariance': -np.eye(4)}, 'positive definite'),
-        ({'transition': np.eye(3)}, '2 x 2 and 2 probabilities'),
-        ({'transition': [[0.5, 0.4], [0.0, 1.0]]}, 'row 0 of the transition matrix sums to 0.9'),
-        ({'models': [cv(noise=0.1)] * 2}, 'names of their own'),
-        ({'initial': [0.5, 0.6]}, '2 probabilities'),
-        ({'initial': [1.5, -0.5]}, '2 probabilities'),
-        ({'dt': 0.0}, 'dt has to be positive'),
-    ],
-)
+@pytest.mark.parametrize('values, problem', [
+    ({'mean': [0.0, 0.0]}, 'mean and covariance need 4 and 4 x 4 values, for px, py, vx, vy'),
+    ({'covariance': -np.eye(4)}, 'positive definite'),
+    ({'transition': np.eye(3)}, '2 x 2 and 2 probabilities'),
+    ({'transition': [[0.5, 0.4], [0.0, 1.0]]}, 'row 0 of the transition matrix sums to 0.9'),
+    ({'models': [cv(noise=0.1)] * 2}, 'names of their own'),
+    ({'initial': [0.5, 0.6]}, '2 probabilities'),
+    ({'initial': [1.5, -0.5]}, '2 probabilities'), ({'dt': 0.0}, 'dt has to be positive'),
+])  # fmt: skip
 def test_what_does_not_fit_is_refused(values, problem):
     with pytest.raises(ValueError, match=problem):
         IMM(**{'models': MODELS, 'transition': T, **START, **values})

@@ -27,6 +27,10 @@ from sonar_imm.trackers import SYSTEMS
 
 PACKAGE = Path(sonar_imm.__file__).parent
 WARM = 'from sonar_imm_tools.cli import main; raise SystemExit(main(["warm", "fathometer"]))'
+DAMAGE = {
+    'a flipped byte': lambda content: bytes([content[0] ^ 4]) + content[1:],
+    'cut': lambda content: content[:-9],
+}
 
 
 def begin(code, cache, *, root=PACKAGE.parent, arguments=(), **environment):
@@ -69,12 +73,6 @@ def warm(tmp_path, monkeypatch):
 def test_what_was_done_is_a_sentence(warm):
     assert warm().startswith('1 kernels compiled, 0 loaded, ')
     assert warm().startswith('0 kernels compiled, 1 loaded, ')
-
-
-DAMAGE = {
-    'a flipped byte': lambda content: bytes([content[0] ^ 4]) + content[1:],
-    'cut': lambda content: content[:-9],
-}
 
 
 @pytest.mark.parametrize('suffix', ['nbi', 'nbc'])

@@ -28,6 +28,9 @@ T = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
 TWO = np.array([[0.95, 0.05], [0.3, 0.7]])
 """Asymmetric: a transposed matrix would show."""
 SIGMAS = 4.5
+MODES = ((0.01, 0.0), (0.5, 1.0))
+"""Variance and drift of the two scalar walks."""
+Z = np.array([0.1, -0.3, 0.4, 1.7, 2.2, 2.5, 3.9, 4.0])
 
 
 def still(x, rng, dt):
@@ -61,7 +64,6 @@ def close(samples, exact, bias):
 
 
 def test_where_the_state_says_nothing_it_is_the_forward_algorithm():
-    """To the last digits, and in any order of the models."""
     rng, names, order = np.random.default_rng(3), np.array(['a', 'b', 'c']), [2, 0, 1]
     likelihood = rng.random((30, 3))
     likelihood[7] = likelihood[8] = 1.0
@@ -84,7 +86,6 @@ def test_where_the_state_says_nothing_it_is_the_forward_algorithm():
 
 
 def test_one_linear_model_is_the_kalman_filter():
-    """Mean and covariance within Monte Carlo error, and the truth inside the bounds of each."""
     rng, count = np.random.default_rng(7), 60
     F, Q, H, R = np.array([[1.0, 1.0], [0.0, 1.0]]), np.diag([0.1, 0.05]), np.eye(1, 2), np.eye(1)
     root, inside, off, spread, total = np.sqrt(Q), 0, [], [], []
@@ -115,10 +116,6 @@ def test_one_linear_model_is_the_kalman_filter():
     assert 0.95 * count - 3 * math.sqrt(0.0475 * count) <= inside
 
 
-MODES = ((0.01, 0.0), (0.5, 1.0))
-"""Variance and drift of the two scalar walks."""
-
-
 def tree(transition, z, variance=0.25):
     """Probabilities (2,) of the models, mean and variance after 8 steps, and the log-likelihood:
     one Kalman filter for each of the 512 sequences of models."""
@@ -137,9 +134,6 @@ def tree(transition, z, variance=0.25):
     return [*np.bincount(mode, weight), mean, weight @ (P + (x - mean) ** 2), total]
 
 
-Z = np.array([0.1, -0.3, 0.4, 1.7, 2.2, 2.5, 3.9, 4.0])
-
-
 def particle_run(seed, order):
     rng = np.random.default_rng(seed)
     tracker = ParticleIMM(
@@ -155,7 +149,6 @@ def particle_run(seed, order):
 
 
 def test_two_models_are_the_tree_of_all_sequences():
-    """The same seed gives the same bytes, and another does not."""
     runs = [particle_run(seed, order=(1, 0)) for seed in range(40)]
     assert np.std(runs, axis=0)[0] < 0.02
     assert close(runs, tree(TWO, Z), bias=0.002)
@@ -230,32 +223,26 @@ GOOD = {'models': {'a': still, 'b': still}, 'transition': TWO, 'particles': np.o
         'log_likelihood': normal(1.0)}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    'values, problem',
-    [
-        ({'models': {}}, 'at least one'),
-        ({'transition': np.eye(3)}, '2 x 2 and 2 probabilities'),
-        ({'particles': np.ones(10)}, r'\(N, n\) or \(2, N, n\), got shape \(10,\)'),
-        ({'particles': np.full((10, 2), np.nan)}, 'finite'),
-        ({'log_likelihood': {'a': normal(1.0)}}, 'one for each of a, b, got a'),
-        ({'rng': 3}, 'has to be a numpy.random.Generator, got 3'),
-        ({'resample_below': 2.0}, 'between 0 and 1'),
-    ],
-)
+@pytest.mark.parametrize('values, problem', [
+    ({'models': {}}, 'at least one'),
+    ({'transition': np.eye(3)}, '2 x 2 and 2 probabilities'),
+    ({'particles': np.ones(10)}, r'\(N, n\) or \(2, N, n\), got shape \(10,\)'),
+    ({'particles': np.full((10, 2), np.nan)}, 'finite'),
+    ({'log_likelihood': {'a': normal(1.0)}}, 'one for each of a, b, got a'),
+    ({'rng': 3}, 'has to be a numpy.random.Generator, got 3'),
+    ({'resample_below': 2.0}, 'between 0 and 1'),
+])  # fmt: skip
 def test_what_does_not_fit_is_refused(values, problem):
     with pytest.raises(ValueError, match=problem):
         ParticleIMM(**{'rng': np.random.default_rng(0), **GOOD, **values})
 
 
-@pytest.mark.parametrize(
-    'values, problem',
-    [
-        ({'models': {'a': still, 'b': lambda x, rng, dt: x[:5]}}, r"'b' .* got shape \(5, 3\)"),
-        ({'models': {'a': lambda x, rng, dt: x / 0.0, 'b': still}}, "'a' has to give finite"),
-        ({'log_likelihood': lambda x, z: x}, r"'a' has to give 10 numbers.* got shape \(10, 3\)"),
-        ({'log_likelihood': lambda x, z: x[:, 0] * np.nan}, 'none of them NaN'),
-    ],
-)
+@pytest.mark.parametrize('values, problem', [
+    ({'models': {'a': still, 'b': lambda x, rng, dt: x[:5]}}, r"'b' .* got shape \(5, 3\)"),
+    ({'models': {'a': lambda x, rng, dt: x / 0.0, 'b': still}}, "'a' has to give finite"),
+    ({'log_likelihood': lambda x, z: x}, r"'a' has to give 10 numbers.* got shape \(10, 3\)"),
+    ({'log_likelihood': lambda x, z: x[:, 0] * np.nan}, 'none of them NaN'),
+])  # fmt: skip
 def test_functions_that_give_something_else_are_refused_and_nothing_changes(values, problem):
     tracker = ParticleIMM(**{'rng': np.random.default_rng(0), **GOOD, **values})
     before = tracker.particles.copy()
@@ -321,14 +308,12 @@ def test_normalise_survives_what_underflows_and_nothing_is_uniform():
         assert (w == 0.25).all() and np.isneginf(log_sum).all()
 
 
-W = np.array([0.05, 0.0, 0.4, 0.15, 0.3, 0.1])
-
-
 def test_each_particle_is_drawn_as_often_as_its_weight_says():
+    w = np.array([0.05, 0.0, 0.4, 0.15, 0.3, 0.1])
     rng, runs, count = np.random.default_rng(1), 5000, 7
-    copies = [np.bincount(systematic(W, count, rng), minlength=len(W)) for _ in range(runs)]
+    copies = [np.bincount(systematic(w, count, rng), minlength=len(w)) for _ in range(runs)]
     error = np.std(copies, axis=0) / np.sqrt(runs)
-    assert (np.abs(np.mean(copies, axis=0) - count * W) <= 4.5 * error + 1e-12).all()
+    assert (np.abs(np.mean(copies, axis=0) - count * w) <= 4.5 * error + 1e-12).all()
     assert not np.any(copies, axis=0)[1]
 
 

@@ -28,6 +28,7 @@ ASYMMETRIC = np.array([[0.6, 0.3, 0.1], [0.15, 0.5, 0.35], [0.05, 0.15, 0.8]])
 EXACT_LOG_EVIDENCE = 298.6663117
 """Of the records of exact_hmm.npz, by enumeration of all sets of up to three members on the 60
 cells, in a program of its own."""
+CELLS, SETS = 400, 20_000
 
 
 @pytest.fixture(scope='module')
@@ -56,26 +57,19 @@ def run(model, records, particles, seed):
     return np.array(pmfs), np.array(intensities), sum(evidence)
 
 
-def variation(pmf, exact):
-    return 0.5 * np.abs(pmf - exact['exP']).sum(axis=1).mean()
-
-
 def test_the_pmf_and_the_evidence_are_the_exact_ones(model, exact):
     pmf, intensity, evidence = run(model, exact['B'], 20_000, seed=1)
-    assert variation(pmf, exact) <= 0.008
+    assert 0.5 * np.abs(pmf - exact['exP']).sum(axis=1).mean() <= 0.008
     assert abs(evidence - EXACT_LOG_EVIDENCE) < 0.5
     assert np.abs(intensity - exact['exI']).sum(axis=1).mean() < 0.06
 
 
-@pytest.mark.parametrize(
-    'change',
-    [
-        {'amplitude_prior': 'bic_half'},
-        {'amplitude_prior': 'paper', 'transition': ASYMMETRIC},
-        {'shift': Shift(std=2.0, step=2), 'negative_probability': 0.3, 'amplitude_memory': 0.9},
-        {'jump': JUMP, 'negative_probability': 0.3, 'amplitude_memory': 0.9},
-    ],
-)
+@pytest.mark.parametrize('change', [
+    {'amplitude_prior': 'bic_half'},
+    {'amplitude_prior': 'paper', 'transition': ASYMMETRIC},
+    {'shift': Shift(std=2.0, step=2), 'negative_probability': 0.3, 'amplitude_memory': 0.9},
+    {'jump': JUMP, 'negative_probability': 0.3, 'amplitude_memory': 0.9},
+])  # fmt: skip
 def test_likelihoods_are_those_of_the_definition_and_amplitudes_go_with_members(
     model, exact, change
 ):
@@ -83,10 +77,8 @@ def test_likelihoods_are_those_of_the_definition_and_amplitudes_go_with_members(
     tracker, b = SetFilter(changed, N), np.pad(exact['B'][3], changed.pad)
     record = tracker.record(b, (1, 2))
     sets = tracker.start(record).sets
-    sets = sets._replace(
-        prior_mean=rng.uniform(0.5, 3.0, sets.cell.shape),
-        prior_variance=rng.uniform(0.5, 4.0, sets.cell.shape),
-    )
+    mean, variance = (rng.uniform(0.5, most, sets.cell.shape) for most in (3.0, 4.0))
+    sets = sets._replace(prior_mean=mean, prior_variance=variance)
     propagated = tracker.propagate(Weighted(sets, np.zeros(N)), record)
     moved, possible = propagated.sets, np.isfinite(propagated.log_weight)
     assert len(set(moved.order)) == 3
@@ -245,9 +237,6 @@ def test_models_that_cannot_be_are_refused(model):
     assert [model.room(m) for m in (0, 1, 2)] == [1, 60, pairs]
 
 
-# -- members from the intensity of many sets ------------------------------------------------------
-
-
 def hills(*places):
     sums = np.zeros((5, 100))
     for place, mass, amplitude in places:
@@ -298,11 +287,6 @@ def test_of_two_humps_the_greater_is_reported_with_its_own_spread():
         assert np.array_equal(found, expected)
 
 
-# -- sets over the time of several records, against as many steps of one --------------------------
-
-CELLS, SETS = 400, 20_000
-
-
 @pytest.fixture
 def wide():
     return set_model.SetModel(
@@ -322,7 +306,6 @@ def test_the_sum_of_walks_is_their_convolution():
 
 @pytest.mark.parametrize(('least', 'records'), [(0, 1), (3, 7)])
 def test_who_left_and_was_replaced(least, records):
-    """Against members that are drawn one by one."""
     P = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.3, 0.1, 0.6]])
     found = set_model.turnover(P, least, records)
     orders = found.reshape(3, -1, 3).sum(axis=1)
@@ -366,7 +349,6 @@ def prior(wide, steps, records):
 
 
 def test_one_long_step_is_as_several_short_ones(wide):
-    """The order, whether a member is still there, and how far it has walked."""
     at_once, by_steps = prior(wide, 1, 5), prior(wide, 5, 1)
     assert at_once[0] == pytest.approx(by_steps[0], abs=0.02)
     assert at_once[1] == pytest.approx(by_steps[1], abs=0.02) and at_once[1] < 0.95
@@ -375,7 +357,6 @@ def test_one_long_step_is_as_several_short_ones(wide):
 
 @pytest.mark.parametrize('shift', [None, Shift(std=1.5, memory=0.9)])
 def test_proposals_after_a_gap_change_no_result(wide, shift):
-    """With those that look at the record and those that do not."""
     changed = evolve(wide, negative_probability=0.3, shift=shift)
     rng = np.random.default_rng(1)
     b = rng.standard_normal(changed.record_cells)
@@ -411,9 +392,6 @@ def test_amplitudes_and_shifts_are_forgotten_by_the_time(wide):
     assert later.prior_mean[0, 0] == pytest.approx(2.0 * 0.9**3)
     fresh = (1.0 - 0.9**6) * wide.amplitude_std**2
     assert later.prior_variance[0, 0] == pytest.approx(0.9**6 * 0.5 + fresh)
-
-
-# -- the offset between members and the shift they share, drawn anew ------------------------------
 
 
 @pytest.mark.parametrize('step', [1, 4])

@@ -17,26 +17,19 @@ from helpers.set_cycle import cycle, steps, weigh
 import numpy as np
 import pytest
 
-from sonar_imm.estimation import set_proposals
+from sonar_imm.estimation import set_model, set_proposals
 from sonar_imm.estimation.set_filter import LagSmoother, SetFilter
-from sonar_imm.estimation.set_model import (
-    banded_transition,
-    gaussian_walk,
-    independent_orders,
-    SetModel,
-    Sets,
-    Walks,
-)
 from sonar_imm.estimation.set_shifts import Jump, Shift
 
 N = 400
 GRAM = np.sinc(np.arange(N) / 5.0)
-MODEL = SetModel(
-    cells=N, separation=20, order_min=1, transition=banded_transition(12, 0.05),
-    walk=gaussian_walk(4.0), gram=GRAM,
+MODEL = set_model.SetModel(
+    cells=N, separation=20, order_min=1, transition=set_model.banded_transition(12, 0.05),
+    walk=set_model.gaussian_walk(4.0), gram=GRAM,
 )  # fmt: skip
 PLACES = np.array([40, 85, 112, 160, 203, 251, 300, 352])
 SIGMAS = np.array([34.0, 6.0, 28.0, 7.0, 22.0, 9.0, 30.0, 8.0])
+CELLS, JUMP_AT = 11, 3
 
 
 def record(places, sigmas, n=N, seed=None):
@@ -51,7 +44,6 @@ def record(places, sigmas, n=N, seed=None):
 
 @pytest.mark.parametrize('more', [0, 30])
 def test_what_stands_out_is_each_member_without_the_others(more):
-    """Also in a record that is longer than the lattice, as with a shift."""
     b = record(PLACES, SIGMAS, N + more)
     alone, peaks = set_proposals.standing_out(MODEL, b, GRAM)
     assert len(peaks.first) == len(PLACES)
@@ -94,21 +86,23 @@ def test_the_first_record_leaves_many_sets():
 
 def test_independent_members_pay_for_their_places_alone():
     factorials = np.array([math.factorial(m) for m in range(5)])
-    assert independent_orders(0, 5) == pytest.approx(1.0 / factorials / (1.0 / factorials).sum())
-    among = independent_orders(7, 3)
+    assert set_model.independent_orders(0, 5) == pytest.approx(
+        1.0 / factorials / (1.0 / factorials).sum()
+    )
+    among = set_model.independent_orders(7, 3)
     assert among.sum() == pytest.approx(1.0)
     assert among[1:] / among[:-1] == pytest.approx([1 / 8, 1 / 9])
-    assert independent_orders(64, 1) == pytest.approx([1.0])
+    assert set_model.independent_orders(64, 1) == pytest.approx([1.0])
     with pytest.raises(ValueError, match='start'):
-        evolve(MODEL, start=independent_orders(1, 11))
+        evolve(MODEL, start=set_model.independent_orders(1, 11))
 
 
 def test_before_the_first_record_members_neither_come_nor_go():
     """The orders of a first record by the sum over all sets and all that they walk."""
-    n, walk, start = 10, np.array([0.25, 0.5, 0.25]), independent_orders(0, 3)
-    model = SetModel(
-        cells=n, separation=2, order_min=0, transition=banded_transition(3, 0.2), walk=walk,
-        gram=np.exp(-0.5 * np.arange(n) ** 2.0), amplitude_std=3.0, start=start,
+    n, walk, start = 10, np.array([0.25, 0.5, 0.25]), set_model.independent_orders(0, 3)
+    model = set_model.SetModel(
+        cells=n, separation=2, order_min=0, transition=set_model.banded_transition(3, 0.2),
+        walk=walk, gram=np.exp(-0.5 * np.arange(n) ** 2.0), amplitude_std=3.0, start=start,
     )  # fmt: skip
     b = np.random.default_rng(8).standard_normal(n)
     b[[2, 3, 7]] += 2.0, 3.0, 1.5
@@ -120,7 +114,7 @@ def test_before_the_first_record_members_neither_come_nor_go():
                 apart = np.append(np.diff(places), np.diff(z)).min(initial=2)
                 if apart < 2 or z.min(initial=0) < 0 or z.max(initial=0) >= n:
                     continue
-                sets = Sets.empty(model, 1)
+                sets = set_model.Sets.empty(model, 1)
                 sets.order[:], sets.cell[0, :m] = m, z
                 chance = np.prod(walk[np.array(moves, int) + 1]) / model.room(m)
                 exact[m] += start[m] * chance * np.exp(weigh(model, b, sets)[0][0])
@@ -141,7 +135,7 @@ def test_walks_are_drawn_by_what_they_come_to(wide, all_sums):
     kind, centre = (np.arange(n) % 3 == 1).astype(np.int64), np.array([0, 3])
     wanted = rng.random(2 * n) < 0.6
     tables = set_proposals.WalkTables(*np.full((2, 2 * n, 5), 7.0), np.full(2 * n, 7.0))
-    walks = Walks(kind, centre, probability, wide)
+    walks = set_model.Walks(kind, centre, probability, wide)
     set_proposals.fill_walks(walks, g, share, wanted, tables, all_sums=all_sums)
     for row in range(2 * n):
         sign, z = divmod(row, n)
@@ -163,14 +157,9 @@ def test_walks_are_drawn_by_what_they_come_to(wide, all_sums):
             assert tables.ratio[row] == pytest.approx(ratio, rel=1e-12)
 
 
-# -- jumps that all members make together: against sums over all sets, jumps and walks ------------
-
-CELLS, JUMP_AT = 11, 3
-
-
 @pytest.fixture(scope='module')
 def model():
-    return SetModel(
+    return set_model.SetModel(
         cells=CELLS, separation=2, order_min=0,
         transition=np.array([[0.6, 0.3, 0.1], [0.15, 0.5, 0.35], [0.05, 0.15, 0.8]]),
         start=np.array([0.2, 0.3, 0.5]), walk=np.array([0.25, 0.6, 0.15]),
@@ -233,7 +222,7 @@ def exact(model, records):
     shifts."""
     states = list(every_set(model))
     orders = np.array([len(state) - model.order_min for state in states])
-    sets = Sets.empty(model, len(states))
+    sets = set_model.Sets.empty(model, len(states))
     there = np.zeros((len(states), model.cells))
     p = np.array([model.start[m] / model.room(m + model.order_min) for m in orders])
     for k, state in enumerate(states):
@@ -277,16 +266,12 @@ def run(model, records, particles, seed):
     return tuple(np.array(column) for column in zip(*found))
 
 
-@pytest.mark.parametrize(
-    'change',
-    [
-        {},
-        {'walk_share': 0.0, 'birth_share': 0.0},
-        {'jump': Jump(probability=0.4, std=1.0, step=1, reach=5), 'negative_probability': 0.0},
-        {'jump': None, 'shift': Shift(std=1.5, memory=0.6)},
-        {'jump': None, 'shift': Shift(std=2.0, step=2), 'negative_probability': 0.0},
-    ],
-)
+@pytest.mark.parametrize('change', [
+    {}, {'walk_share': 0.0, 'birth_share': 0.0},
+    {'jump': Jump(probability=0.4, std=1.0, step=1, reach=5), 'negative_probability': 0.0},
+    {'jump': None, 'shift': Shift(std=1.5, memory=0.6)},
+    {'jump': None, 'shift': Shift(std=2.0, step=2), 'negative_probability': 0.0},
+])  # fmt: skip
 def test_sets_that_jump_or_share_a_shift_are_the_exact_ones(model, records, change):
     changed = evolve(model, **change)
     heard = np.pad(records, [(0, 0), (changed.pad, changed.pad)])
@@ -329,7 +314,7 @@ def test_what_is_smoothed_jumped_when_it_did(model, records):
 def test_walks_that_lead_off_the_lattice_leave_numbers(model, records, centre):
     """As of a slope that is steep at the end of the lattice, wherever a jump leads before."""
     tracker, probability = SetFilter(model, 300), np.array([[0.2, 0.6, 0.2]])
-    walks = Walks(np.zeros(CELLS, np.int64), np.array([centre]), probability, True)
+    walks = set_model.Walks(np.zeros(CELLS, np.int64), np.array([centre]), probability, True)
     before = cycle(tracker, None, records[0], (1, 0)).after
     sets = tracker.propagate(before, tracker.record(records[1], (1, 1), walks=walks))
     assert not np.isnan(sets.log_weight).any()

@@ -6,8 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The likelihood of a bin of `trackers.bathymetry.filter_kernels` in numpy, bit for bit the same:
-its exponentials, cosines and sines, its table, and what states mean."""
+"""Likelihoods of a bin as in `trackers.bathymetry.filter_kernels`, the same to the bit; and of a
+direction, from their definitions."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import math
 
 import numpy as np
 
+from sonar_imm.acoustics.laplace import IMPOSSIBLE, log_density
 from sonar_imm.trackers.bathymetry import filter_kernels as k
 
 
@@ -106,3 +107,26 @@ def drift(state, t, g):
             after = math.copysign(math.pi, down) - after
         out[s] = after - g.tilt[t]
     return out
+
+
+def log_likelihood(sines, y, signal_variance, noise_variance, step, likelihood='laplace'):
+    """Log likelihood of direction sines (...) given one snapshot y (P,), less what does not depend
+    on the direction; -inf for NaN. `step` is from `array.phase_step`."""
+    a = np.exp(1j * step * np.asarray(sines)[..., None] * np.arange(len(y)))
+    kappa = signal_variance / (noise_variance + len(y) * signal_variance)
+    beam = np.abs(a.conj() @ y) ** 2
+    q = (np.vdot(y, y).real - kappa * beam) / noise_variance
+    density = log_density(q, len(y)) if likelihood == 'laplace' else -q
+    return np.where(np.isnan(q), IMPOSSIBLE, density)
+
+
+def interfered_log_likelihood(sines, y, signal_variance, covariance, step, likelihood='laplace'):
+    """The same, given the noise covariance (P, P) of the snapshot, by linear algebra."""
+    u, staves = np.asarray(sines), len(y)
+    a = np.exp(1j * step * np.nan_to_num(u)[..., None] * np.arange(staves))
+    gamma = covariance + signal_variance * a[..., :, None] * a[..., None, :].conj()
+    solved = np.linalg.solve(gamma, np.broadcast_to(y[:, None], (*u.shape, staves, 1)))[..., 0]
+    q = (y.conj() * solved).sum(axis=-1).real
+    density = log_density(q, staves) if likelihood == 'laplace' else -q
+    determinant = np.linalg.slogdet(gamma)[1] - np.linalg.slogdet(covariance)[1]
+    return np.where(np.isnan(u), IMPOSSIBLE, density - determinant)

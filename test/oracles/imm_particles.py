@@ -31,8 +31,7 @@ class WeightUpdate(NamedTuple):
 
 
 def resample(x, w, mu, transition, uniform):
-    """Equally weighted x (M, n, N) for each model, and its predicted probability
-    c (M,).
+    """Equally weighted x (M, n, N) for each model, and its predicted probability c (M,).
 
     A model that nothing can become (c_j below `LEAST_CHANCE`) draws from the mixture of all, so
     that it stays finite and can come back when the chain allows. uniform (M,) in [0, 1).
@@ -106,11 +105,6 @@ def summarise(x, w, mu):
     return mean, covariance
 
 
-def effective_sample_size(w, mu):
-    """sum_j mu_j / sum_n w_jn^2: how many particles of the likely models count."""
-    return _total(np.array([m / _total(np.square(row)) for m, row in zip(mu, w)]))
-
-
 def filter_bins(x, w, mu, models, chains, uniform, noise, echo, look, drift):
     """All bins of a ping; a bin's mean, covariance, mu, log likelihood and effective sample size
     each, and the particles at the end. look(state, t): log likelihoods; drift(state, t): where
@@ -128,12 +122,11 @@ def filter_bins(x, w, mu, models, chains, uniform, noise, echo, look, drift):
             kind = np.arange(M)
         for j in range(M):
             mixed[j, 0] = drift(mixed[j, 0], t)
-        x = propagate(
-            mixed, models.F[kind], (models.G * models.scale[t][:, None, None])[kind], noise[t]
-        )
+        G = models.G * models.scale[t][:, None, None]
+        x = propagate(mixed, models.F[kind], G[kind], noise[t])
         if echo[t]:
             w, mu, log_likelihood, _ = weigh(np.array([look(row, t) for row in x[:, 0]]), c)
-        size = effective_sample_size(w, mu)
+        size = _total(np.array([m / _total(np.square(row)) for m, row in zip(mu, w)]))
         if len(chains) > 1 and echo[t]:
             x, _ = resample(x, w, mu, chains[1], uniform[t, 1])
             w = np.full((M, N), 1.0 / N)

@@ -16,7 +16,7 @@ bit, the others within what they say themselves.
 import functools
 import math
 
-from helpers.diver_runs import arrivals, fix
+from helpers.diver_runs import arrivals
 from helpers.faults.figures import Figures
 import numpy as np
 import pytest
@@ -34,6 +34,8 @@ T0 = 1_700_000_000 * SECOND
 UTM = np.array([5e5, 4e6, 0.0])
 LATER = 10**9 * SECOND // 4
 """A quarter of 1e9 s: after more, the seconds of a header are over."""
+FIGURES = Figures('metamorphic')
+FEW = {'particles': 2000, 'order_max': 4, 'pulse': 'gaussian', 'pulse_width': 0.18}
 
 
 class Motion:
@@ -67,14 +69,11 @@ class Motion:
 
 
 MOTIONS = {
-    'turned by a quarter': Motion(turn_deg=90.0),
-    'turned by 22.5 degrees': Motion(turn_deg=22.5),
-    'moved to UTM': Motion(shift=UTM),
-    'mirrored': Motion(mirror=True),
-    'mirrored, turned and moved': Motion(45.0, UTM, True),
-    'later': Motion(late_ns=LATER),
+    'turned by a quarter': Motion(turn_deg=90.0), 'turned by 22.5 degrees': Motion(turn_deg=22.5),
+    'moved to UTM': Motion(shift=UTM), 'mirrored': Motion(mirror=True),
+    'mirrored, turned and moved': Motion(45.0, UTM, True), 'later': Motion(late_ns=LATER),
     'in 1970': Motion(late_ns=SECOND - T0),
-}
+}  # fmt: skip
 
 
 def agree(given, kind, got, wanted, tolerance, relative=False):
@@ -254,9 +253,6 @@ def traces(deeper=0.0, late_ns=0, louder=1.0):
     return found
 
 
-FIGURES = Figures('metamorphic')
-
-
 def note(system, how, moved, tolerance, given):
     FIGURES.add({'system': system, 'how': how, 'moved': moved}, tolerance=tolerance, **given)
 
@@ -291,14 +287,11 @@ def test_a_scene_that_is_elsewhere_or_at_another_time(case, name):
     note(system, how, name, tolerance, same(where_it_is(case), moved, motion, tolerance))
 
 
-ORDERS = [
+@pytest.mark.parametrize('case, name, other', [
     ('diver gnn', 'divers in another order', {'order': (1, 0)}),
     ('diver gnn', 'receivers in another order', {'receivers': (2, 0, 3, 1)}),
     ('obstacle all behaviours', 'echoes in another order', {'order': (1, 0)}),
-]
-
-
-@pytest.mark.parametrize('case, name, other', ORDERS)
+])  # fmt: skip
 def test_what_is_told_in_another_order(case, name, other):
     scene, same, parameters, _ = CASES[case]
     system, _, how = case.partition(' ')
@@ -331,9 +324,6 @@ def reflectors():
     plain = run('fathometer', traces(), **FEW)
     assert all((each.extras['existence'] > 0.5).sum() == 2 for each in plain[1:])
     return plain
-
-
-FEW = {'particles': 2000, 'order_max': 4, 'pulse': 'gaussian', 'pulse_width': 0.18}
 
 
 def test_reflectors_twice_as_loud():
@@ -371,12 +361,3 @@ def test_reflectors_at_another_time():
         agree(values, 'states', off, 0.0 * off, 1.0)
     agree(values, 'probabilities', later[-1].probabilities, plain[-1].probabilities, 0.2)
     note('fathometer', 'particles', 'later', 1.0, values)
-
-
-def test_single_fixes_far_from_the_origin_keep_their_digits():
-    """A diver who swims a millimetre between fixes of a millimetre, at UTM coordinates."""
-    for shift in (np.zeros(3), UTM):
-        fixes = [fix(k + 1, *(shift[:2] + [1e-3 * k, 0.0]), np.eye(2) * 1e-8) for k in range(10)]
-        last = run('diver', fixes, model_set='linear')[-1]
-        assert abs(last.state[0, 0] - shift[0] - 9e-3) < 1e-4
-        assert abs(last.state[0, 2] - 1e-3) < 2e-4

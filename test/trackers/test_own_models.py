@@ -50,7 +50,6 @@ CODE = '''
 
     from sonar_imm import Model, Motion
 
-
     class Turns:
         """Straight on and turning, by numerical integration."""
 
@@ -62,7 +61,6 @@ CODE = '''
             self.models = [
                 turn('straight', 0.0, 0.1), turn('left', rate, 0.3), turn('right', -rate, 0.3)
             ]
-
 
     def turn(name, rate, noise):
         A = np.zeros((4, 4))
@@ -77,7 +75,6 @@ CODE = '''
             return Motion(F, F @ block[:4, 4:], np.zeros(4))
 
         return Model(name, ('px', 'py', 'vx', 'vy'), motion)
-
 
     class Headings:
         """heading_speed again: velocities are outputs; standing has no speed of its own."""
@@ -96,10 +93,8 @@ CODE = '''
                 outputs = {'vx': (0, 0, ux), 'vy': (0, 0, uy)}
                 self.models.append(Model(name, ('px', 'py', 'speed'), swim(built_in, j), outputs))
 
-
     def swim(built_in, j):
         return lambda x, dt: Motion(*(part[j] for part in built_in.motion(dt)))
-
 
     class Mover:
         """The behaviour moving of the obstacle tracker again."""
@@ -113,16 +108,13 @@ CODE = '''
         def step(self, dt):
             return 1.0, dt, dt / 2.0, self.noise * dt, self.slow
 
-
     class NoStart(Turns):
         def __init__(self, config):
             super().__init__(config)
             del self.start
 
-
     class Narrow(Turns):
         transition = np.eye(2)
-
 
     class Curved(Turns):
         def __init__(self, config):
@@ -131,14 +123,11 @@ CODE = '''
             curved = lambda x, dt: Motion(np.eye(4) * x[2], *zeros)
             self.models[0] = Model('curved', ('px', 'py', 'vx', 'vy'), curved)
 
-
     def broken(config):
         raise RuntimeError('no licence')
 
-
     def nothing(config):
         return object()
-
 
     class Wild(Mover):
         def step(self, dt):
@@ -191,10 +180,9 @@ def test_a_set_gives_the_estimates_of_the_same_filter_alone(installed):
         assert mine.probabilities[0] == pytest.approx(imm.model_probabilities, abs=1e-9)
 
 
-AGAIN = [{}, {'fix_bias_std': 0.5, 'association': 'jipda'}, {'dimensions': 3}]
-
-
-@pytest.mark.parametrize('values', AGAIN)
+@pytest.mark.parametrize('values', [
+    {}, {'fix_bias_std': 0.5, 'association': 'jipda'}, {'dimensions': 3},
+])  # fmt: skip
 def test_a_diver_model_written_again_gives_the_same_estimates(installed, values):
     ours, theirs = (
         run(DiverTracker(DiverConfig(model_set=name, **values)), fixes())
@@ -205,18 +193,6 @@ def test_a_diver_model_written_again_gives_the_same_estimates(installed, values)
         for name in ('state', 'covariance', 'probabilities'):
             mine, due = (getattr(each, name) for each in pair)
             assert mine == pytest.approx(due, rel=1e-9, abs=1e-9)
-
-
-WRONG = [
-    ('nostart', r'\(sonar_imm.models: tiny_models:NoStart\).* lacks start'),
-    ('curved', 'a motion depends on the state'),
-    ('narrow', 'transition needs a row for each of 3 models'),
-    ('broken', 'RuntimeError: no licence'),
-    ('absent', "AttributeError: module 'tiny_models' has no attribute 'absent'"),
-    ('module', "ModuleNotFoundError: No module named 'not_there'"),
-    ('nothing', 'object lacks models, transition, start'),
-    ('nobody', 'a name that a package registers as sonar_imm.models, got .tiny_nobody'),
-]
 
 
 def test_a_behaviour_written_again_gives_the_same_estimates(installed):
@@ -236,19 +212,25 @@ def test_a_behaviour_written_again_gives_the_same_estimates(installed):
     assert moving > 0.9
 
 
-@pytest.mark.parametrize('name, problem', WRONG)
+@pytest.mark.parametrize('name, problem', [
+    ('nostart', r'\(sonar_imm.models: tiny_models:NoStart\).* lacks start'),
+    ('curved', 'a motion depends on the state'),
+    ('narrow', 'transition needs a row for each of 3 models'),
+    ('broken', 'RuntimeError: no licence'),
+    ('absent', "AttributeError: module 'tiny_models' has no attribute 'absent'"),
+    ('module', "ModuleNotFoundError: No module named 'not_there'"),
+    ('nothing', 'object lacks models, transition, start'),
+    ('nobody', 'a name that a package registers as sonar_imm.models, got .tiny_nobody'),
+])  # fmt: skip
 def test_what_cannot_be_used_is_one_sentence(installed, name, problem):
     with pytest.raises(ConfigError, match=problem) as caught:
         DiverConfig.from_mapping({'model_set': f'tiny_{name}'})
     assert len(caught.value.problems) == 1 and '\n' not in str(caught.value)
 
 
-BEHAVIOURS = [
+@pytest.mark.parametrize('name, problem', [
     ('wild', 'a step has to be finite'), ('nothing', 'object lacks std, velocity, share, step'),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize('name, problem', BEHAVIOURS)
+])  # fmt: skip
 def test_behaviours_too(installed, name, problem):
     with pytest.raises(ConfigError, match=problem):
         ObstacleConfig.from_mapping({'behaviours': ['fixed', f'tiny_{name}']})
@@ -361,14 +343,11 @@ def test_shared_parameters_come_from_their_base(system):
         assert not names & own or issubclass(config_type, base)
 
 
-CHANGED = [
+@pytest.mark.parametrize('system, changed, fixed', [
     ('diver', {'gate_probability': 0.99}, {'directions': 8}),
     ('fathometer', {'existence_min': 0.7}, {'particles': 7}),
     ('obstacle', {'birth_rate': 1.0}, {'components': 5}),
-]
-
-
-@pytest.mark.parametrize('system, changed, fixed', CHANGED)
+])  # fmt: skip
 def test_a_running_tracker_takes_over_what_may_change(system, changed, fixed):
     config = SYSTEMS[system].config_type()
     tracker = SYSTEMS[system].build(config())

@@ -49,6 +49,14 @@ from sonar_imm_tools.recordings.reader import BagReader
 
 ENDLESS = Path('/proc/self/maps')
 """A regular file whose size, the system says, is 0."""
+CHANGES = [
+    {'version': '9.9.9'}, {'system': 'submarine'}, {'system': ['diver']}, {'parameters': []},
+    {'saved_ns': 'now'}, {'newest_ns': 1.5}, {'extras': ['list']},
+]  # fmt: skip
+QUICK = {'fathometer': {'particles': '200'}}
+SHORT = {'fathometer': ['--set', 'records=8']}
+MOST = 48
+BAG = {'bathymetry': 'ship', 'diver': 'multistatic', 'fathometer': 'pressure', 'obstacle': 'wreck'}
 
 
 @pytest.fixture
@@ -139,10 +147,8 @@ def test_an_object_gets_no_attribute_that_is_no_state(file):
 def test_what_stands_in_its_place_is_of_its_kind(file):
     header, arrays = parts_of(file)
     stream = header['state']['tracker']['_stream']
-    scans, values = (
-        stream['_history'],
-        (None, 5, 'x', {}, [['a', 1.5]], [[1, 1]], [1, 2], 2**70, True),
-    )
+    scans = stream['_history']
+    values = None, 5, 'x', {}, [['a', 1.5]], [[1, 1]], [1, 2], 2**70, True
     places = (stream, 'frames'), (stream, '_gate'), (scans, '_stamps'), (stream, 'counts')
     wrong = [(*place, value) for place in places for value in values]
     wrong += [(scans, '_scans', [[]]), (scans, '_stamps', scans['_stamps'][::-1])]
@@ -162,7 +168,6 @@ ARRAYS = [
 
 
 def test_an_array_is_as_large_as_its_bytes(file):
-    """In the header, and in the archive beside it."""
     header, arrays = parts_of(file)
     places = [owner for owner, key in places_in(header['state']) if key == 'array']
     place = next(owner for owner in places if owner['array'] == '<f8')
@@ -173,13 +178,7 @@ def test_an_array_is_as_large_as_its_bytes(file):
     write_state(file, run.saved(run.until(30)))
     header, arrays = parts_of(file)
     name, good = next(iter(arrays.items()))
-    bad = (
-        good[:0],
-        good[..., None],
-        good.astype('f4'),
-        good.astype('>f8'),
-        np.array([print, print]),
-    )
+    bad = good[:0], good[..., None], good.astype('f4'), good.astype('>f8'), np.array([print] * 2)
     more = {**arrays, 'tracker/more': np.zeros(1000)}
     for others in (*({**arrays, name: each} for each in bad), {}, more):
         refuse(file, header, others)
@@ -229,18 +228,12 @@ def test_an_archive_holds_what_it_says(file):
     for body in (
         zipped([header, ('x.npy', npy(1 << 26))], zipfile.ZIP_DEFLATED),
         zipped([header, ('x.npy', npy(1))], claim=1 << 31),
-        zipped([header, ('x.npy', npy(10, claim=99))]),
-        zipped([header, ('x.npy', npy(10, claim=11))]),
-        zipped([header, header]),
-        zipped([header, ('x.npy', b'')]),
-        zipped([('x.npy', npy(1))]),
+        *(zipped([header, ('x.npy', npy(10, claim=claim))]) for claim in (99, 11)),
+        *map(zipped, ([header, header], [header, ('x.npy', b'')], [('x.npy', npy(1))])),
         zipped([(f'{k}.npy', b'') for k in range(30_000)]),
         zipped([('header.npy', b'x'), ('x.npy', b'\x93NUMPY\x01\x00\xff\xff')]),
         zipped([('header.npy', pickle.dumps(5))]),
-        zipped([header])[:-22] + b'PK\6\7' + b'\0' * 16 + end,
-        end,
-        b'',
-        b'x',
+        *(zipped([header])[:-22] + b'PK\6\7' + b'\0' * 16 + end, end, b'', b'x'),
     ):
         sealed(file, body)
         refused(file)
@@ -290,8 +283,6 @@ POSE = {
     'class': 'Pose', 'position': {'array': '<f8', 'shape': [3], 'bytes': '00' * 24},
     'R': {'array': '<f8', 'shape': [3, 3], 'bytes': '00' * 72},
 }  # fmt: skip
-
-
 ORIGIN = {'class': 'Origin', 'latitude': 1.0, 'longitude': 2.0, 'height': 3.0}
 VECTOR = {'array': '<f8', 'shape': [2], 'bytes': '00' * 16}
 GOOD = [
@@ -304,8 +295,6 @@ GOOD = [
     (VECTOR, FloatArray | float | str), ('x', FloatArray | float | str),
     (1.5, FloatArray | float | str),
 ]  # fmt: skip
-
-
 BAD = [
     (True, float), (True, int), (5.0, int), ('5', int), (2**70, int), ([1.5], tuple[int, ...]),
     ([1], tuple[int, str]), (5, list[int]), ([[1, 1]], dict[str, int]),
@@ -352,12 +341,6 @@ def test_parameters_that_may_change_are_those_of_now(file):
         tracker_from(read_state(file), run.system, fixed)
     with pytest.raises(StateError, match='of a diver tracker'):
         tracker_from(read_state(file), obstacle, obstacle.config_type()())
-
-
-CHANGES = [
-    {'version': '9.9.9'}, {'system': 'submarine'}, {'system': ['diver']}, {'parameters': []},
-    {'saved_ns': 'now'}, {'newest_ns': 1.5}, {'extras': ['list']},
-]  # fmt: skip
 
 
 def test_the_file_is_named_arrays_and_json(tmp_path):
@@ -467,14 +450,6 @@ def test_a_state_that_cannot_be_written_leaves_the_old_one(file, monkeypatch):
         write_state(file, run.saved(run.until(8)))
     assert file.read_bytes() == before
     assert [path.name for path in file.parent.iterdir()] == ['state']
-
-
-QUICK = {'fathometer': {'particles': '200'}}
-SHORT = {'fathometer': ['--set', 'records=8']}
-MOST = 48
-
-
-BAG = {'bathymetry': 'ship', 'diver': 'multistatic', 'fathometer': 'pressure', 'obstacle': 'wreck'}
 
 
 def values_of(spec):

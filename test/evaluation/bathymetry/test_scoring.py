@@ -15,7 +15,7 @@ from attrs import evolve
 from helpers.bathymetry_cases import floor
 from helpers.commands import run
 import numpy as np
-from oracles.array_likelihood import log_likelihood
+from oracles.bin_likelihood import log_likelihood
 import pytest
 
 from sonar_imm.acoustics import array

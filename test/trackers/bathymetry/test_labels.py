@@ -17,7 +17,7 @@ from helpers.bathymetry_cases import EXACT, floor
 from helpers.estimates import same
 from helpers.vector_files import load_vectors
 import numpy as np
-from oracles import two_surfaces as oracle
+from oracles import terrain as oracle
 import pytest
 from scipy.ndimage import gaussian_filter1d
 

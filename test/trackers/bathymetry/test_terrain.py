@@ -15,7 +15,7 @@ from attrs import evolve
 from helpers.bathymetry_cases import EXACT, floor
 from helpers.vector_files import load_vectors
 import numpy as np
-from oracles.array_likelihood import log_likelihood
+from oracles.bin_likelihood import log_likelihood
 from oracles.terrain import smoothed
 import pytest
 from scipy.stats import norm

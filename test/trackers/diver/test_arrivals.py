@@ -134,8 +134,6 @@ STD, TOA_STD, SPEED = np.radians(2.0), 2e-4, 1500.0
 EVERYWHERE = (0.0, 0.0, 0.0, 360.0, 0.0, 1e6)
 """A coverage that says no more than that the sensor stands at the origin."""
 SINGLE = {'max_tracks': 1, 'model_set': 'linear', 'coverage_sector': EVERYWHERE}
-
-
 CALM = {'max_tracks': 1, 'model_set': 'linear', 'acceleration_noise': (0.02,)}
 
 
@@ -152,9 +150,8 @@ def last(config, measurements):
 
 
 def test_positions_as_a_sensor_shows_them_are_turned_about_it_and_back():
-    config = DiverConfig(
-        model_set='linear', acceleration_noise=(0.1, 0.1, 0.1), bearing_bias_std_deg=2.0
-    )
+    noise = {'acceleration_noise': (0.1, 0.1, 0.1), 'bearing_bias_std_deg': 2.0}
+    config = DiverConfig(model_set='linear', **noise)
     models = build_models(config)
     layout = Instruments().with_sensor('').layout(config, models)
     rng, place = np.random.default_rng(1), np.array([5.0, -3.0])
@@ -172,9 +169,8 @@ def test_positions_as_a_sensor_shows_them_are_turned_about_it_and_back():
     seen, covariance = models.to_common(rows.blocks)
     for row in np.ndindex(2, 3):
         np.testing.assert_allclose(seen[row], turned(x[row]), atol=1e-12)
-        T = np.stack(
-            [(turned(x[row] + h) - turned(x[row] - h)) / 2e-6 for h in 1e-6 * np.eye(5)], axis=1
-        )
+        ends = [turned(x[row] + h) - turned(x[row] - h) for h in 1e-6 * np.eye(5)]
+        T = np.stack(ends, axis=1) / 2e-6
         np.testing.assert_allclose(covariance[row], T @ P[row] @ T.T, rtol=1e-6, atol=1e-6)
     again = models.to_common(layout.rotate_about_sensor(rows, models, '', place, back=True).blocks)
     np.testing.assert_allclose(again[0], x, atol=1e-12)
@@ -199,9 +195,7 @@ def test_a_considered_bearing_widens_the_ellipse_across_and_moves_no_estimate(as
 
 def test_where_nobody_knows_where_a_sensor_stands_nothing_is_added():
     config = {'max_tracks': 1, 'model_set': 'linear'}
-    plain, same = (
-        last({**config, **more}, path())[0] for more in ({}, {'bearing_bias_std_deg': 2})
-    )
+    plain, same = (last({**config, 'bearing_bias_std_deg': std}, path())[0] for std in (0.0, 2.0))
     np.testing.assert_array_equal(same.covariance, plain.covariance)
 
 
@@ -278,9 +272,6 @@ def test_the_place_of_a_sensor_is_part_of_what_a_fix_is():
     assert plain.key() != placed.key() and plain.key() == evolve(plain).key()
 
 
-EVERY = 'every'
-
-
 def legs(place, tag=False):
     reach = np.linalg.norm(RECEIVERS - [*place, 0.0], axis=1)
     return reach if tag else reach + np.hypot(*place)
@@ -289,10 +280,8 @@ def legs(place, tag=False):
 def ping_of(place, tag=False, error=0.0, rows=slice(None)):
     """The arrivals of a diver at `place` (2,) at the receivers `rows`, with errors (4,), m."""
     toa = (legs(place, tag) + error)[rows] / SPEED
-    known = {'tx': [np.nan if tag else 0.0] * 3, 'var_toa': TOA_STD**2}
-    return arrivals(
-        1, RECEIVERS[rows], toa, tx_id=np.ones(len(toa)), rx_id=np.arange(4)[rows], **known
-    )
+    known = {'tx': [np.nan if tag else 0.0] * 3, 'var_toa': TOA_STD**2, 'tx_id': np.ones(len(toa))}
+    return arrivals(1, RECEIVERS[rows], toa, rx_id=np.arange(4)[rows], **known)
 
 
 def evidence(places, received, errors, tag=False):
@@ -342,7 +331,7 @@ def test_the_evidence_is_what_least_squares_gains_by_an_error_of_each_pair(tag, 
         return np.sum((y - part @ np.linalg.lstsq(part, y, rcond=None)[0]) ** 2)
 
     gain = left(A[:, :-4]) - left(A)
-    value, rank = found.evidence(config)[EVERY]
+    value, rank = found.evidence(config)['every']
     scatter = max((found.square - gain) / (found.freedom - rank), 1.0)
     assert value * scatter == pytest.approx(gain, rel=0.1)
     assert value > chi2_limit(rank)

@@ -279,17 +279,14 @@ def test_clean_fixes_are_not_doubted():
     assert not any(tracker.warnings() for tracker in trackers)
 
 
-TWO_PLACES = [
-    ((6.0, 8.0), 0.3, {}), ((1.8, 2.4), 0.3, {}), ((-6.0, 0.0), 1.0, {'association': 'gnn'}),
-    ((60.0, 80.0), 1.0, {}),
-]  # fmt: skip
-
-
 def way(t):
     return 20.0 * np.stack([np.cos(0.03 * t), np.sin(0.03 * t)], axis=-1)
 
 
-@pytest.mark.parametrize('offset, std, settings', TWO_PLACES)
+@pytest.mark.parametrize('offset, std, settings', [
+    ((6.0, 8.0), 0.3, {}), ((1.8, 2.4), 0.3, {}), ((-6.0, 0.0), 1.0, {'association': 'gnn'}),
+    ((60.0, 80.0), 1.0, {}),
+])  # fmt: skip
 def test_both_places_are_held_and_said(offset, std, settings):
     truth, z = swim(90, std=std)
     z[1::2] += offset
@@ -320,14 +317,11 @@ def test_a_place_without_fixes_is_given_up():
     assert not tracker.warnings()
 
 
-SAID = [
+@pytest.mark.parametrize('scene, seed, due', [
     # A row with an offset and hardly any weight is there first.
     ('diver, unnamed, 10 m', 701, 'two groups'), ('diver, b 3 m off', 602, '3 m apart'),
     ('boat, b 2 s late', 600, '2 s late'), ('boat, two sensors', 600, ''),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize('scene, seed, due', SAID)
+])  # fmt: skip
 def test_an_offset_or_a_delay_is_said_and_nothing_else(scene, seed, due):
     items, truth = fixes_of(SINGLE[scene], seed)
     tracker = DiverTracker(DiverConfig(target=SINGLE[scene].target, max_tracks=1))

@@ -37,11 +37,18 @@ from sonar_imm.trackers.diver.tracker import DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate
 
 CV = {'model_set': 'linear', 'association': 'gnn', 'gate_probability': 0.999999}
-
-
 ONE = {'dimensions': 3, 'max_tracks': 1}
 Z, W = 2, 5
 """Of z and its rate in the published state."""
+WHOLE, GAP = ([-3.3, -10.0, -16.7], [4.8] * 3), ([-2.0, -2.1, -8.0], [0.2] * 3)
+"""Means and variances that fill the column, and of two depths."""
+PAST = {
+    'receiver_depths': (2.0, 5.0, 8.0, 12.0), 'depth': (1.0, 19.0), 'swell_height': 1.0,
+    'random_rotation': False, 'start': (-40.0, 40.0),
+}  # fmt: skip
+ASKING = np.array([[-40.0, 0.0, 0.0], [40.0, 0.0, 0.0], [10.0, 70.0, 0.0]])
+TURNED = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+"""By an angle between two headings of the models."""
 
 
 def spatial(variance, *across):
@@ -153,13 +160,10 @@ def test_what_is_less_than_the_water_column_says_does_not_replace_it():
     assert estimate.covariance[0, Z, Z] < 40.0
 
 
-NO_HEIGHT = [
+@pytest.mark.parametrize('covariance', [
     np.eye(2), *map(spatial, (math.nan, 0.0, -1.0, 1e6)), spatial(0.25, 0.6),
     spatial(0.25, 0.4, 0.4), spatial(0.25, math.nan),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize('covariance', NO_HEIGHT)
+])  # fmt: skip
 def test_what_states_no_height_that_can_be_true_changes_no_bit(covariance):
     def run(stated, dimensions=3):
         fixes = [fix(k, -5.0, stated, 0.5 * k) for k in range(1, 8)]
@@ -209,18 +213,16 @@ def test_a_start_may_state_how_deep():
     assert estimate.covariance[0, Z, Z] == pytest.approx(0.04)
 
 
-SEEN = np.array([30.0, 40.0, -12.0])
-
-
 def test_latitude_and_longitude_and_what_a_transceiver_sees_bring_their_heights():
+    spot = np.array([30.0, 40.0, -12.0])
     origin, stamps = (54.0, 10.0, 40.0), [k * SECOND for k in range(1, 9)]
-    place = dict(zip(('latitude', 'longitude', 'height'), Origin(*origin).geodetic(SEEN).tolist()))
+    place = dict(zip(('latitude', 'longitude', 'height'), Origin(*origin).geodetic(spot).tolist()))
     place['covariance'] = spatial(0.25)
     geodetic = [GeodeticFix(stamp_ns=stamp, **place) for stamp in stamps]
     assert last(geodetic, **ONE, origin=origin).state[0, Z] == pytest.approx(-12.0, abs=1e-3)
     flat = [evolve(each, height=math.nan) for each in geodetic]
     assert last(flat, **ONE, origin=origin).covariance[0, Z, Z] > 25.0
-    seen = [RelativeFix(stamp_ns=stamp, offset=SEEN) for stamp in stamps]
+    seen = [RelativeFix(stamp_ns=stamp, offset=spot) for stamp in stamps]
     relative = last(seen, **ONE, origin=(0.0, 0.0, 40.0), vessel='fixed')
     assert relative.state[0, Z] == pytest.approx(-12.0, abs=0.1)
     assert relative.covariance[0, Z, Z] < 2.0
@@ -262,41 +264,25 @@ def test_copies_that_agree_are_spread_with_the_same_mean_and_covariance():
     assert (np.linalg.eigvalsh(P) > 0.0).all() and after['respreads'].tolist() == [1]
 
 
-STAY = [
+@pytest.mark.parametrize('means, variance, path_std', [
     ([-3.0, -10.0, -17.0], 4.8, 0.3),  # they do not agree
     ([-9.5, -9.6, -9.4], 0.1, 0.3),  # nothing bends within what they believe
     ([-9.5, -9.6, -9.4], 4.0, 10.0),  # it does, but not to see
-]
-
-
-@pytest.mark.parametrize('means, variance, path_std', STAY)
+])  # fmt: skip
 def test_other_copies_stay(means, variance, path_std):
     state, tracker = banked(means, [variance] * 3, [0.4, 0.3, 0.3])
     after = after_spread(state, tracker, path_std)
     assert after.rows is state.rows and not after['respreads'].any()
 
 
-WHOLE, GAP = ([-3.3, -10.0, -16.7], [4.8] * 3), ([-2.0, -2.1, -8.0], [0.2] * 3)
-"""Means and variances that fill the column, and of two depths."""
-
-
-TWO_DEPTHS = [
+@pytest.mark.parametrize('means, variances, weights, two', [
     (*WHOLE, [0.34, 0.33, 0.33], False), (*WHOLE, [0.5, 0.0, 0.5], True),
     (*GAP, [0.4, 0.4, 0.2], True), (*GAP, [0.5, 0.49, 0.01], False),
     ([-8.0, -2.0, -5.0], [0.2, 0.2, 2.0], [0.3, 0.3, 0.4], False),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize('means, variances, weights, two', TWO_DEPTHS)
+])  # fmt: skip
 def test_two_depths_are_said_where_there_is_a_gap_between_them(means, variances, weights, two):
     state, tracker = banked(means, variances, weights)
     assert ambiguous_depths(state, tracker.models).tolist() == [two]
-
-
-PAST = {
-    'receiver_depths': (2.0, 5.0, 8.0, 12.0), 'depth': (1.0, 19.0), 'swell_height': 1.0,
-    'random_rotation': False, 'start': (-40.0, 40.0),
-}  # fmt: skip
 
 
 def past_the_transmitter(seed):
@@ -307,13 +293,10 @@ def past_the_transmitter(seed):
     return [item.measurement for item in scene.measurements], places
 
 
-UNKNOWN_SIDE = [
+@pytest.mark.parametrize('settings, two', [
     ({'dimensions': 3}, [True]), ({'dimensions': 2}, None),
     ({'dimensions': 3, 'depth_min': 4.0, 'depth_max': 4.0}, None),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize('settings, two', UNKNOWN_SIDE)
+])  # fmt: skip
 def test_paths_alone_tell_no_depth_above_from_one_below_the_receivers(settings, two):
     rx, place = RECEIVERS - [0.0, 0.0, 10.0], np.array([30.0, 40.0, -4.0])
     path = np.linalg.norm(rx - place, axis=1) + np.linalg.norm(rx[0] - place)
@@ -370,11 +353,6 @@ def test_a_track_that_was_somewhere_else_begins_anew_with_all_its_rows():
     assert error @ np.linalg.solve(covariance[0, :3, :3], error) < 12.0
 
 
-ASKING = np.array([[-40.0, 0.0, 0.0], [40.0, 0.0, 0.0], [10.0, 70.0, 0.0]])
-TURNED = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
-"""By an angle between two headings of the models."""
-
-
 def transponders(second, position, rng, count, std=0.5):
     """Two-way transponders of transponders that the first `count` receivers ask."""
     rx = ASKING[:count].copy()
@@ -395,10 +373,6 @@ def layout_of(config):
     return Instruments().layout(config, build_models(config))
 
 
-def rows_of(models, x, P, mu):
-    return models.make_rows(x[None, None], P[None, None], mu[None, None], np.zeros((1, 1)))
-
-
 def test_the_image_is_that_of_an_independent_prototype():
     config = DiverConfig(covariance_scales=(1.0,))
     models, layout = build_models(config), layout_of(config)
@@ -407,7 +381,9 @@ def test_the_image_is_that_of_an_independent_prototype():
     line = sides.line_through(np.array([a, b]), 0.5)
     quiet = np.eye(len(models.names))[-1]
     each = np.tile(x, (len(quiet), 1)), np.tile(P, (len(quiet), 1, 1))
-    rows = sides.with_images(rows_of(models, *each, quiet), 0, models, layout, line)
+    parts = (part[None, None] for part in (*each, quiet))
+    rows = models.make_rows(*parts, np.zeros((1, 1)))
+    rows = sides.with_images(rows, 0, models, layout, line)
     parts = rows.blocks[1].x[..., -1], rows.blocks[1].P[..., -1]
     mean, covariance = rows.combine(*parts, rows.weight)
     np.testing.assert_allclose(parts[0][1], found['mirrored_x'], atol=1e-12)
@@ -495,7 +471,6 @@ def test_a_third_receiver_or_a_bearing_or_a_fix_decides(what):
 
 
 def test_who_crosses_the_line_is_in_doubt_again():
-    """Decided by a third receiver, then with two: far from the line it stays known."""
     rng, tracker = np.random.default_rng(5), DiverTracker(DiverConfig(max_tracks=1))
     path = positions(60, start=(-20.0, 15.0), velocity=(0.3, -0.6))
     pings = [transponders(k + 1, p, rng, 3 if k < 10 else 2) for k, p in enumerate(path)]

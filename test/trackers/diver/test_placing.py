@@ -10,7 +10,7 @@
 sensor sees, and who leaves it."""
 
 from attrs import evolve
-from helpers.diver_runs import arrivals, fix, followed, miss, run, scan, SECOND
+from helpers.diver_runs import arrivals, fix, followed, run, scan, SECOND
 import numpy as np
 import pymap3d
 import pytest
@@ -29,16 +29,28 @@ from sonar_imm.trackers.state_file import json_parameters
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
 ORIGIN = Origin(59.0, 10.0)
+FAR = Origin(10.0, 60.0)
+LEVER = {'transceiver_lever': (2.0, 0.0, -1.0), 'transceiver_mount_rpy_deg': (0.0, 0.0, 90.0)}
+EXACT = {
+    'relative_range_std': 0.01, 'relative_angle_std_deg': 0.001,
+    'vessel_heading_std_deg': 0.0, 'vessel_attitude_std_deg': 0.0,
+}  # fmt: skip
+"""Instruments without errors: what errors turn is shorter on average, which is undone."""
+PIER = {**LEVER, 'vessel': 'fixed', 'transceiver_lever': (5.0, 0.0, 0.0)}
+TURNS = {
+    'levelled': ({}, 1.0, True, [30.0, 0.0]),
+    'declination of nav': ({'magnetic_declination_deg': 20.0}, 0.0, False, [30.0, 0.0]),
+    'a pier needs no pose': (PIER, None, False, [5.0, 30.0]),
+}
+AHEAD = (0.0, 0.0, 0.0, 90.0, 0.0, 50.0)
+"""A sonar at the origin that looks along x, 45 degrees to either side, 50 m far."""
 
 
 def geodetic(second, enu, cls=GeodeticFix, origin=ORIGIN, **values):
     latitude, longitude, height = origin.geodetic(np.array(enu, float))
-    return cls(
-        stamp_ns=round(second * SECOND),
-        latitude=latitude,
-        longitude=longitude,
-        **{'height': height, 'covariance': 0.04 * np.eye(3), **values},
-    )
+    known = {'latitude': latitude, 'longitude': longitude, 'height': height}
+    known['covariance'] = 0.04 * np.eye(3)
+    return cls(stamp_ns=round(second * SECOND), **{**known, **values})
 
 
 def quaternion(yaw):
@@ -126,14 +138,9 @@ def test_navigation_that_nothing_needs_decides_nothing():
 
 def test_an_unknown_height_is_that_of_the_origin():
     config = DiverConfig(origin=(59.0, 10.0, 40.0))
-    known, unknown = (
-        run(DiverTracker(config), [geodetic(1, (2e4, 0.0, 0.0), **height)])[0].state
-        for height in ({'height': 40.0}, {'height': np.nan})
-    )
-    assert known.tolist() == unknown.tolist()
-
-
-FAR = Origin(10.0, 60.0)
+    fixes = [geodetic(1, (2e4, 0.0, 0.0), height=height) for height in (40.0, np.nan)]
+    known, unknown = (run(DiverTracker(config), [each])[0].state.tolist() for each in fixes)
+    assert known == unknown
 
 
 def way(count):
@@ -177,9 +184,6 @@ def test_a_vessel_whose_first_position_is_wrong_places_its_targets():
     there = ORIGIN.geodetic(np.array([2.0 * 28.5 + 20.28, 5.0, 0.0]))
     assert last.extras['latitude'] == pytest.approx([there[0]], abs=1e-5)
     assert last.extras['longitude'] == pytest.approx([there[1]], abs=2e-5)
-
-
-LEVER = {'transceiver_lever': (2.0, 0.0, -1.0), 'transceiver_mount_rpy_deg': (0.0, 0.0, 90.0)}
 
 
 def test_a_relative_fix_is_composed_with_the_pose_between_two_messages():
@@ -277,25 +281,13 @@ def test_a_clock_that_was_set_back_forgets_the_vessel():
 
 def test_a_position_and_a_heading_make_a_pose():
     where = [geodetic(k, (98.0 + 2.0 * k, 0.0, 0.0), VesselFix) for k in (1, 2)]
-    items = [
-        where[0],
-        heading(1),
-        relative(1.5, (0.0, 20.0, 0.0)),
-        where[1],
-        heading(2, np.pi / 2),
-    ]
+    seen = relative(1.5, (0.0, 20.0, 0.0))
+    items = [where[0], heading(1), seen, where[1], heading(2, np.pi / 2)]
     made = run(DiverTracker(DiverConfig(origin=(59.0, 10.0, 0.0))), items)
     half = np.pi / 4
     expected = [101.0 - 20.0 * np.sin(half), 20.0 * np.cos(half)]
     assert made[-1].state[0, :2] == pytest.approx(expected, abs=0.05)
     assert made[-1].frame_id == 'map' and 'latitude' in made[-1].extras
-
-
-EXACT = {
-    'relative_range_std': 0.01, 'relative_angle_std_deg': 0.001,
-    'vessel_heading_std_deg': 0.0, 'vessel_attitude_std_deg': 0.0,
-}  # fmt: skip
-"""Instruments without errors: what errors turn is shorter on average, which is undone."""
 
 
 def placed(config, vessel, offset, yaw=0.0, **values):
@@ -307,10 +299,9 @@ def placed(config, vessel, offset, yaw=0.0, **values):
     return estimate
 
 
-NORTH_AND_SOUTH = [(0.0, False), (60.0, True), (-60.0, False), (88.0, True), (-88.0, False)]
-
-
-@pytest.mark.parametrize('latitude, levelled', NORTH_AND_SOUTH)
+@pytest.mark.parametrize('latitude, levelled', [
+    (0.0, False), (60.0, True), (-60.0, False), (88.0, True), (-88.0, False),
+])  # fmt: skip
 def test_relative_positions_far_from_the_origin_are_exact_up_to_88_degrees(latitude, levelled):
     """A vessel 10 km from the origin, a diver 1 km from the vessel; against pymap3d."""
     origin = (latitude, 170.0, 12.0)
@@ -346,14 +337,6 @@ def test_covariances_turn_with_the_axes():
     assert np.diag(found.covariance[0, :2, :2]) == pytest.approx([1.0, 25.0], rel=0.05)
 
 
-PIER = {**LEVER, 'vessel': 'fixed', 'transceiver_lever': (5.0, 0.0, 0.0)}
-TURNS = {
-    'levelled': ({}, 1.0, True, [30.0, 0.0]),
-    'declination of nav': ({'magnetic_declination_deg': 20.0}, 0.0, False, [30.0, 0.0]),
-    'a pier needs no pose': (PIER, None, False, [5.0, 30.0]),
-}
-
-
 @pytest.mark.parametrize('what', TURNS)
 def test_what_does_not_turn_with_the_vessel(what):
     config, yaw, levelled, place = TURNS[what]
@@ -363,31 +346,6 @@ def test_what_does_not_turn_with_the_vessel(what):
     assert estimate.state[0, :2] == pytest.approx(place, abs=0.05)
 
 
-@pytest.mark.statistics
-def test_the_tracker_is_consistent_with_all_errors_drawn():
-    """A diver that rests is seen by a transceiver on a vessel that circles it: NEES."""
-    rng, nees = np.random.default_rng(5), []
-    stds = {'vessel_position_std': 0.5, 'vessel_heading_std_deg': 1.0, 'relative_range_std': 0.5}
-    for _ in range(12):
-        tracker, made = DiverTracker(DiverConfig(**stds)), []
-        for k in range(1, 41):
-            angle = 0.05 * k
-            where = np.array([60.0 * np.cos(angle), 60.0 * np.sin(angle), 0.0])
-            yaw = angle + np.pi / 2
-            seen = rotation(0, 0, yaw).T @ (-where)
-            turn = rotation(0.0, *np.radians(2.0) * rng.normal(size=2))
-            offset = turn @ seen * (1.0 + 0.5 * rng.normal() / np.linalg.norm(seen))
-            at = where + 0.5 * rng.normal(size=3) * [1, 1, 0]
-            noisy = pose(k, *at[:2], yaw + np.radians(rng.normal()), frame_id='map')
-            made += run(tracker, [noisy, relative(k, offset, frame_id='usbl')])
-        nees.append(miss(made[-1], np.zeros(2))[1])
-    assert 0.5 < np.mean(nees) < 4.0  # 2 is due, for 24 numbers
-
-
-AHEAD = (0.0, 0.0, 0.0, 90.0, 0.0, 50.0)
-"""A sonar at the origin that looks along x, 45 degrees to either side, 50 m far."""
-
-
 def written(tmp_path, name, header, rows):
     file = tmp_path / name
     file.write_text('\n'.join([header, *(','.join(map(str, row)) for row in rows)]) + '\n')
@@ -395,18 +353,14 @@ def written(tmp_path, name, header, rows):
 
 
 def ids_by_scan(config, scans):
-    return [
-        estimate.extras['track_id'][estimate.extras['track_state'] > 0].tolist()
-        for estimate in followed(DiverTracker(config), scans)
-    ]
+    made = followed(DiverTracker(config), scans)
+    return [each.extras['track_id'][each.extras['track_state'] > 0].tolist() for each in made]
 
 
-LEAVES = [('gnn', 'families'), ('jipda', 'heading_speed'), ('gnn', 'linear')]
-
-
-@pytest.mark.parametrize('association, model_set', LEAVES)
+@pytest.mark.parametrize('association, model_set', [
+    ('gnn', 'families'), ('jipda', 'heading_speed'), ('gnn', 'linear'),
+])  # fmt: skip
 def test_who_leaves_the_sector_keeps_his_track(association, model_set):
-    """A diver who swims across the edge of the sector at 50 m, turns about and comes back."""
     there = np.concatenate([np.arange(35.0, 50.0, 0.75), 49.8 - np.arange(0.0, 15.0, 0.75)])
     seen = {second: (x, 0.3) for second, x in zip([*range(1, 21), *range(36, 56)], there)}
     scans = [scan(k, seen[k]) if k in seen else scan(k) for k in range(1, 56)]
@@ -433,11 +387,9 @@ def test_an_echo_sounder_that_covers_a_sector_misses_nobody_outside():
         toa = ((leg + leg[0]) / 1500.0)[rows]
         return arrivals(second * SECOND, RECEIVERS[rows], toa, tx=np.zeros(3), frame_id='')
 
-    pings, configs = (
-        list(map(ping, range(1, 60))),
-        (DiverConfig(), DiverConfig(coverage_sector=AHEAD)),
-    )
-    assert [len(ids_by_scan(config, pings)[-1]) for config in configs] == [0, 1]
+    pings = list(map(ping, range(1, 60)))
+    for config, count in ((DiverConfig(), 0), (DiverConfig(coverage_sector=AHEAD), 1)):
+        assert len(ids_by_scan(config, pings)[-1]) == count
 
 
 def test_existence_of_a_diver_who_is_not_seen_is_the_closed_recursion(tmp_path):
@@ -535,16 +487,6 @@ def test_each_sensor_has_its_own():
     assert tracks[-1] == tracks[8] != [] and not gone[-1]
 
 
-NO_TABLES = [
-    ('x,y,p', [(0, 0, 0.5)], 'its first line has to be x,y,probability or range,probability'),
-    ('range,probability', [(0, 0.5)], 'at least two values on each axis'),
-    ('range,probability', [(0, 0.5), (0, 0.4), (1, 0.1)], 'each place once'),
-    ('range,probability', [(0, 0.5), (1, 1.5)], 'a probability is not between 0 and 0.9999'),
-    ('range,probability', [(0, 0.5), (1, 'x')], 'could not convert'),
-    ('x,y,probability', [(0, 0, 0.5), (1, 0.5)], 'inhomogeneous'),
-]
-
-
 def test_two_divers_outside_are_not_taken_for_one():
     config = DiverConfig(association='jipda', coverage_sector=AHEAD)
     scans = [scan(k, (42.0 + 0.75 * k, 0.0), (42.0 + 0.75 * k, 3.0)) for k in range(1, 11)]
@@ -552,7 +494,14 @@ def test_two_divers_outside_are_not_taken_for_one():
     assert len(ids_by_scan(config, scans)[-1]) == 2
 
 
-@pytest.mark.parametrize('header, rows, problem', NO_TABLES)
+@pytest.mark.parametrize('header, rows, problem', [
+    ('x,y,p', [(0, 0, 0.5)], 'its first line has to be x,y,probability or range,probability'),
+    ('range,probability', [(0, 0.5)], 'at least two values on each axis'),
+    ('range,probability', [(0, 0.5), (0, 0.4), (1, 0.1)], 'each place once'),
+    ('range,probability', [(0, 0.5), (1, 1.5)], 'a probability is not between 0 and 0.9999'),
+    ('range,probability', [(0, 0.5), (1, 'x')], 'could not convert'),
+    ('x,y,probability', [(0, 0, 0.5), (1, 0.5)], 'inhomogeneous'),
+])  # fmt: skip
 def test_files_that_hold_no_table_are_refused(tmp_path, header, rows, problem):
     file = written(tmp_path, 'table.csv', header, rows)
     for name, said in ((file, problem), (file + '.no', 'table.csv.no')):

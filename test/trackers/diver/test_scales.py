@@ -21,23 +21,25 @@ from sonar_imm.estimation import rows as table
 from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver import bursts, innovations
+from sonar_imm.trackers.diver import scales as law
 from sonar_imm.trackers.diver.estimate import published_state
 from sonar_imm.trackers.diver.fixes import compare, update_stage
 from sonar_imm.trackers.diver.innovations import FARTHEST, FixConsistency, MEMORY
 from sonar_imm.trackers.diver.known import repair_covariances
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.pairing import associate_gnn
-from sonar_imm.trackers.diver.scales import (
-    estimated_scales,
-    MOST_BORROWED,
-    redistribute_weights,
-    scale_priors,
-)
 from sonar_imm.trackers.diver.scan import Scan
 from sonar_imm.trackers.diver.sensors import of_sensor
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 WARNED = 'fix covariances too small by a factor'
+OF_RADAR = {'sensors': ('radar',), 'own': (('radar.fix_std', 2.0),)}
+SETS = [
+    {'association': 'jipda'}, {'association': 'gnn'},
+    {'model_set': 'heading_speed', 'association': 'gnn', 'gate_probability': 0.9999},
+]  # fmt: skip
+PLACES = np.array([[0.0, 0.0], [40.0, 0.0], [80.0, 0.0]])
+GNN = DiverConfig(**SETS[-1])
 
 
 def swim(seed, count=110, std=1.0, stated=1.0, lasting=0.0):
@@ -176,9 +178,9 @@ def test_the_priors_are_what_redistribution_tends_to():
     run(tracker, swim(8, count=30)[0])
     known = tracker._stream.state
     for _ in range(40000):
-        known = redistribute_weights(known, tracker.models.scales)
+        known = law.redistribute_weights(known, tracker.models.scales)
     scale, weight = held(known)
-    prior, large = scale_priors(scale), scale >= 1.0
+    prior, large = law.scale_priors(scale), scale >= 1.0
     due = 0.5 * np.where(large, prior / prior[large].sum(), prior / prior[~large].sum())
     np.testing.assert_allclose(weight, due, rtol=1e-6)
 
@@ -204,16 +206,10 @@ def test_a_rejected_fix_weighs_the_scales_by_the_chance_that_it_is_of_the_track(
     assert due[1000.0] > 100.0 * before[pairs.among.scale == 1000.0][0]
 
 
-OF_RADAR = {'sensors': ('radar',), 'own': (('radar.fix_std', 2.0),)}
-
-
-ASSUMED = [
+@pytest.mark.parametrize('sensor, values, said', [
     ('', {}, True), ('', {'fix_std': 2.0}, False), ('radar', OF_RADAR, False),
     ('lidar', OF_RADAR, True),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize('sensor, values, said', ASSUMED)
+])  # fmt: skip
 def test_a_covariance_that_no_message_states_is_said_from_the_first_fix(sensor, values, said):
     tracker = DiverTracker(DiverConfig(**values))
     first = Fix(stamp_ns=10**9, position=[0.0, 0.0, 0.0], frame_id='map', sensor=sensor)
@@ -252,7 +248,8 @@ def test_a_sensor_that_is_worse_than_it_states_does_not_spoil_the_other_one():
     factor = float(warned.partition('of sensor b too small by a factor ')[2].partition(':')[0])
     assert 10.0 < factor < 25.0 and 'Correct its covariances' in warned
     known = tracker._stream.state
-    assert estimated_scales(known.rows, 0)[0] < 1.5 < 8.0 < estimated_scales(known.rows, 1)[0]
+    good, bad = (law.estimated_scales(known.rows, sensor)[0] for sensor in (0, 1))
+    assert good < 1.5 < 8.0 < bad
 
 
 def test_two_sensors_that_state_the_truth_cost_nothing_and_are_not_warned_about():
@@ -260,7 +257,7 @@ def test_two_sensors_that_state_the_truth_cost_nothing_and_are_not_warned_about(
     rmse, nees, tracker = scored(items, truth)
     due, _, _ = scored([evolve(item, sensor='') for item in items], truth)
     assert rmse < 1.01 * due and 0.8 < nees < 2.8
-    assert not tracker.warnings() and len(tracker._stream.state.borrowed) <= MOST_BORROWED
+    assert not tracker.warnings() and len(tracker._stream.state.borrowed) <= law.MOST_BORROWED
 
 
 @pytest.mark.parametrize(('target', 'speed', 'std'), [('diver', 0.75, 0.3), ('boat', 6.0, 1.0)])
@@ -312,12 +309,6 @@ def test_late_density_is_that_of_the_prototype():
         assert np.logaddexp.reduce(log) == pytest.approx(due, abs=1e-9)
 
 
-SETS = [
-    {'association': 'jipda'}, {'association': 'gnn'},
-    {'model_set': 'heading_speed', 'association': 'gnn', 'gate_probability': 0.9999},
-]  # fmt: skip
-
-
 def swims(divers, seconds, seed, apart=60.0, false=0.0, detected=0.9, scatter=1.0):
     """Scans of divers who turn, `apart` from each other, one array (k, 2) of each diver, and false
     fixes; the scatter of the fixes in terms of what they state."""
@@ -339,7 +330,6 @@ def scans(*arguments, **settings):
 
 @pytest.mark.parametrize('settings', SETS)
 def test_every_row_is_that_of_its_track_whoever_begins_and_ends(settings):
-    """And the weights of a track, with those that it borrows, sum to one."""
     tracker = DiverTracker(DiverConfig(max_tracks=5, **settings))
     scales = np.sort(tracker.models.scales)
     ended, lent, before = 0, 0, tracker._stream.state
@@ -397,9 +387,7 @@ def test_tracks_in_one_table_are_trackers_of_one(settings):
 
 
 @pytest.mark.parametrize('association, scatter', [('jipda', 1.0), ('gnn', 0.5)])
-def test_rows_that_lost_their_weight_would_have_said_nothing_else(
-    association, scatter, monkeypatch
-):
+def test_rows_that_lost_their_weight_say_nothing_else(association, scatter, monkeypatch):
     """A tracker that computes every scale gives the same to a tenth of a standard deviation."""
     config = DiverConfig(max_tracks=5, association=association)
     items = list(scans(2, 60, 7, apart=25.0, scatter=scatter))
@@ -429,7 +417,7 @@ def test_the_covariance_of_a_track_whose_scales_agree_is_that_of_one():
     key = {**one.key, 'scale': of_sensor(np.ones(len(one)), 0)}
     single = known.replace(rows=one.replace(logw=np.zeros(len(one)), key=key))
     wanted = published_state(single, tracker.models, 0.05)
-    for each in (agreeing, redistribute_weights(agreeing, tracker.models.scales)):
+    for each in (agreeing, law.redistribute_weights(agreeing, tracker.models.scales)):
         for ours, due in zip(published_state(each, tracker.models, 0.05), wanted):
             np.testing.assert_allclose(ours, due, rtol=1e-9, atol=1e-12)
 
@@ -468,17 +456,11 @@ def test_a_spoilt_covariance_is_repaired_alone(settings):
         assert np.isfinite(ours).all()
 
 
-PLACES = np.array([[0.0, 0.0], [40.0, 0.0], [80.0, 0.0]])
-
-
 def scan(second, places):
     root = np.random.default_rng(second).normal(size=(len(places), 2, 2))
     P = root @ np.swapaxes(root, 1, 2) + 0.2 * np.eye(2)
     places = np.pad(places, [(0, 0), (0, 1)])
     return Fixes(stamp_ns=second * SECOND, position=places, covariance=P)
-
-
-GNN = DiverConfig(**SETS[-1])
 
 
 def predicted(item, config=GNN, places=PLACES):

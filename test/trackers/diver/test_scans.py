@@ -30,8 +30,6 @@ from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simu
 
 ASSOCIATIONS = ('gnn', 'jipda')
 JIPDA = DiverConfig(association='jipda')
-
-
 SEEDS = [0, *(pytest.param(k, marks=pytest.mark.statistics) for k in (1, 2, 3))]
 
 
@@ -366,10 +364,8 @@ def missed(made):
 @pytest.mark.parametrize('seed', SEEDS[:2])
 def test_fixes_of_a_sensor_that_polls_are_gathered_to_scans(seed):
     """Tracks starve where each fix is a scan."""
-    *alone, made = (
-        run(DiverTracker(DiverConfig(**how)), polled(seed))
-        for how in ({'association': 'gnn'}, {'association': 'jipda'}, {'scan_period': 1.0})
-    )
+    each = {'association': 'gnn'}, {'association': 'jipda'}, {'scan_period': 1.0}
+    *alone, made = (run(DiverTracker(DiverConfig(**how)), polled(seed)) for how in each)
     gathered, ids = missed(made)
     assert min(missed(each)[0] for each in alone) > 0.3 and gathered < 0.01 and len(ids) == 3
     assert {item.stamp_ns % SECOND for item in made} == {SECOND // 2}
@@ -442,11 +438,8 @@ def test_what_is_stated_stays_and_gnn_learns_nothing():
     tracker = DiverTracker(evolve(JIPDA, model_set='heading_speed', clutter_density=1e-4))
     run(tracker, items)
     assert tracker._stream.state.memory['clutter'].by_sensor == ()
-    usual, stated = (
-        run(DiverTracker(DiverConfig(association='gnn', clutter_density=value)), items)
-        for value in (0.0, CLUTTER)
-    )
-    assert all(map(same, usual, stated))
+    configs = [DiverConfig(association='gnn', clutter_density=value) for value in (0.0, CLUTTER)]
+    assert all(map(same, *(run(DiverTracker(config), items) for config in configs)))
 
 
 def test_each_sensor_has_clutter_of_its_own():
@@ -484,13 +477,10 @@ def test_densities_are_bounded():
     assert known.density == clutter.LEAST
 
 
-WARNS = [
+@pytest.mark.parametrize('false, half, settings, warns', [
     (6.0, 60.0, {}, True), (6.0, 60.0, {'clutter_density': 4e-4}, False),
     (6.0, 60.0, {'association': 'jipda'}, False), (0.1, 60.0, {}, False), (1.0, 900.0, {}, False),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize('false, half, settings, warns', WARNS)
+])  # fmt: skip
 def test_gnn_says_that_there_is_clutter(false, half, settings, warns):
     known = {'model_set': 'heading_speed', 'directions': 4, 'association': 'gnn'}
     tracker = DiverTracker(DiverConfig(**{**known, **settings}))

@@ -28,14 +28,14 @@ from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate
 
-SETS = [('linear', 'fixed'), *((each, kind) for each in MODEL_SETS for kind in ADAPTATIONS)]
-
 
 def measurements_of(name, seed, **changes):
     return [item.measurement for item in simulate(scenario(name, changes), seed).measurements]
 
 
-@pytest.mark.parametrize('model_set, adaptation', SETS)
+@pytest.mark.parametrize('model_set, adaptation', [
+    ('linear', 'fixed'), *((each, kind) for each in MODEL_SETS for kind in ADAPTATIONS),
+])  # fmt: skip
 def test_every_set_follows_a_diver_better_than_its_fixes(model_set, adaptation):
     scene = simulate(scenario('zigzag'), seed=3)
     fixes = [item.measurement for item in scene.measurements]
@@ -74,7 +74,6 @@ def test_the_estimate_is_the_contract():
 
 @pytest.mark.statistics
 def test_consistency_where_the_models_hold():
-    """A diver drawn from the models themselves: NEES within its bounds."""
     rng = np.random.default_rng(4)
     config = DiverConfig(
         model_set='heading_speed', adaptation='fixed', max_tracks=1, confirm_hits=1, hover=False,
@@ -112,7 +111,6 @@ def test_a_scan_that_misses_a_diver_teaches_nothing_of_its_turns():
 
 
 def test_no_more_divers_are_confirmed_than_there_can_be():
-    """Of three divers, two that are fixed exactly and one that is often missed, the two stay."""
     rng, fixes = np.random.default_rng(12), []
     for second in range(1, 40):
         for place in (-40.0, 0.0, 40.0):
@@ -208,12 +206,6 @@ def test_a_depth_report_fixes_the_depth():
     assert last.xyz[0, 2] == last.state[0, 2]
 
 
-def test_where_nothing_is_said_of_the_depth_it_stays_as_wide_as_the_water():
-    tracker = DiverTracker(DiverConfig(max_tracks=1, dimensions=3, depth_max=30.0))
-    for estimate in run(tracker, [fix(second, 0.5 * second, 0.0) for second in range(1, 60)]):
-        assert estimate.covariance[0, 2, 2] >= 0.9 * 30.0**2 / 12.0
-
-
 def test_what_is_considered_is_the_same_in_all_models_and_times():
     config = DiverConfig(max_tracks=1, **OFF, systematic_errors='consider')
     tracker = DiverTracker(config)
@@ -243,17 +235,14 @@ def test_receivers_that_come_later_bring_their_prior():
     np.testing.assert_allclose(P[0, 6:, 6:], 1.5**2 * np.eye(3))
 
 
-BACK = [
+@pytest.mark.statistics
+@pytest.mark.parametrize('name, stated', [
     ('at_depth', {'dimensions': 3}), ('misplaced_receivers', OFF),
     ('misplaced_receivers', {**OFF, **NAMED, 'systematic_errors': 'consider'}),
     ('misplaced_receivers', {**OFF, **NAMED, 'systematic_errors': 'estimate'}),
     ('misplaced_receivers', {**OFF, 'dimensions': 3, 'fix_bias_std': 1.0}),
     ('lasting_errors', {'fix_bias_std': 1.0}),
-]  # fmt: skip
-
-
-@pytest.mark.statistics
-@pytest.mark.parametrize('name, stated', BACK)
+])  # fmt: skip
 def test_what_is_stated_is_in_the_covariance_and_looking_back_is_better(name, stated):
     scene = {'duration': 200.0} if name == 'lasting_errors' else {}
     runs, smoothed = zip(*runs_of(name, scene, stated, range(4), smooth=True))
@@ -298,14 +287,11 @@ def test_arrivals_that_miss_name_what_was_not_stated():
         assert 'target_z (or dimensions: 3). Set' in lasting
 
 
-STATED = [
+@pytest.mark.statistics
+@pytest.mark.parametrize('name, seeds, stated', [
     ('at_depth', (1, 14, 19), {'dimensions': 3}), ('misplaced_receivers', (0, 11, 15), OFF),
     ('multistatic', (), {}),
-]  # fmt: skip
-
-
-@pytest.mark.statistics
-@pytest.mark.parametrize('name, seeds, stated', STATED)
+])  # fmt: skip
 def test_arrivals_that_miss_are_known_within_a_minute(name, seeds, stated):
     def warned(seed, config):
         tracker = DiverTracker(DiverConfig(**config))
@@ -365,7 +351,6 @@ def test_scans_needed_before_two_tracks_are_one_follow_from_p_d():
 
 @pytest.mark.parametrize('association', BOTH)
 def test_a_diver_heard_by_name_and_seen_without_is_one_track(association):
-    """The sonar sees the diver first; its track goes on, with the name."""
     tracker, rng = clutter(association), np.random.default_rng(3)
     for second in range(1, 60):
         place = np.array([0.5 * second, 0.0])
@@ -499,10 +484,9 @@ def after(measurements, **options):
     return tracker, run(tracker, measurements)[-1]
 
 
-STARTS = [{}, {'association': 'gnn'}, {'dimensions': 3}, {'max_tracks': 1}]
-
-
-@pytest.mark.parametrize('options', STARTS)
+@pytest.mark.parametrize('options', [
+    {}, {'association': 'gnn'}, {'dimensions': 3}, {'max_tracks': 1},
+])  # fmt: skip
 def test_a_track_begins_confirmed_at_the_place_and_follows_the_fixes_after_it(options):
     tracker, first = after([start(1, 5.0, 7.0, sigma=2.0)], **options)
     assert first.extras['track_state'].tolist() == [1]
@@ -513,7 +497,7 @@ def test_a_track_begins_confirmed_at_the_place_and_follows_the_fixes_after_it(op
     assert last.xyz[0, :2] == pytest.approx([10.5, 7.0], abs=0.5)
 
 
-BESIDE = [
+@pytest.mark.parametrize('measurements, options, due', [
     # The track that is there gives way, and others stay; one that has a name keeps its place.
     ([*walk(), *walk(50.0), start(7.5, 0.3)], {}, {2: (50.0, 1), 3: (0.3, 1)}),
     ([*walk(name=4), start(7.5, 0.1)], {}, {1: (0.0, 1), 2: (0.1, 1)}),
@@ -521,10 +505,7 @@ BESIDE = [
     ([*walk(), start(7.5, 300.0)], {'max_tracks': 1}, {2: (300.0, 1)}),
     ([*walk(), start(7.5, 300.0)], {}, {1: (0.0, 1), 2: (300.0, 1)}),
     ([named_fix(1, 5.0)], {}, {1: (5.0, 0)}),  # without a start the track is tentative
-]
-
-
-@pytest.mark.parametrize('measurements, options, due', BESIDE)
+])  # fmt: skip
 def test_what_becomes_of_tracks_beside_a_start(measurements, options, due):
     _, last = after(sorted(measurements, key=lambda item: item.stamp_ns), **options)
     states = zip(last.xyz[:, 0], last.extras['track_state'])

@@ -26,6 +26,13 @@ from sonar_imm.trackers.fathometer.reflectors import Identified, Identities
 from sonar_imm.trackers.fathometer.response import common_jump
 from sonar_imm.trackers.fathometer.slopes import begun, Common, learned, Slope
 
+ARRAY = 30.0  # m, of the scene
+FEW = {'particles': 2000, 'frequency_min': 100.0, 'frequency_max': 2800.0, 'sound_speed_std': 0.0}
+LAYERS = np.array([52.0, 56.5, 60.0, 64.2, 68.0, 72.5])
+STRENGTH = np.array([25.0, 18.0, 13.0, 10.0, 8.5, 7.0])
+FEWER = {**FEW, 'particles': 1500}
+RECORDS, AT = 24, 14
+
 
 @pytest.fixture(scope='module')
 def heaving():
@@ -47,9 +54,6 @@ def lasting(heaving, seed, records=40):
     return [evolve(each, depth=each.depth + by) for each, by in pairs], wrong
 
 
-WINDOW = {'depth_min': 42.5, 'depth_max': 69.0, 'depth_step': 1 / 64}
-
-
 def kalman(seen, layers, depth_std, memory, lag=0):
     """Mean and sd (T, 2) of the shift whose sum with the mean depth is `seen` (T,), by what is
     seen up to `lag` records later: all of it is jointly Gaussian."""
@@ -64,23 +68,20 @@ def kalman(seen, layers, depth_std, memory, lag=0):
     return np.array(found)
 
 
-@pytest.mark.parametrize(
-    ('heave', 'seed', 'depth_std', 'lag'),
-    [
-        ('independent', 1, 0.1, 5),
-        ('memory', 1, 0.1, 2),
-        pytest.param('independent', 2, 0.3, 0, marks=pytest.mark.statistics),
-        pytest.param('memory', 2, 0.3, 0, marks=pytest.mark.statistics),
-    ],
-)
+@pytest.mark.parametrize('heave, seed, depth_std, lag', [
+    ('independent', 1, 0.1, 5), ('memory', 1, 0.1, 2),
+    pytest.param('independent', 2, 0.3, 0, marks=pytest.mark.statistics),
+    pytest.param('memory', 2, 0.3, 0, marks=pytest.mark.statistics),
+])  # fmt: skip
 def test_the_heave_is_known_as_a_kalman_filter_knows_it(heaving, heave, seed, depth_std, lag):
     """Two Gaussian numbers, heave and depth, which no record tells apart. Of revised records the
     offset is known as the newest one knows it."""
+    window = {'depth_min': 42.5, 'depth_max': 69.0, 'depth_step': 1 / 64}
     if heave == 'memory':
         traces, wrong = lasting(heaving, seed)
     else:
         traces, wrong = list(heaving.traces(range(40))), heaving.file['array_depth_error'][:40]
-    options = {'heave': heave, 'array_depth_std': 0.5, 'depth_std': depth_std, **WINDOW}
+    options = {'heave': heave, 'array_depth_std': 0.5, 'depth_std': depth_std, **window}
     _, found = run(traces, particles=3000, seed=seed, smoothing_lag=lag, **options)
     seen = [heaving.depth_at(each.stamp_ns).mean() + w for each, w in zip(traces, wrong)]
     memory = 0.9 if heave == 'memory' else 0.0
@@ -110,9 +111,6 @@ def test_a_new_spread_of_the_heave_begins_anew(heaving):
     (estimate,) = tracker.process(second)
     assert len(tracker.response.depth) < len(second) + 2 * 40
     assert np.isfinite(estimate.extras['heave_std']).all()
-
-
-ARRAY = 30.0  # m, of the scene
 
 
 @pytest.fixture(scope='module')
@@ -149,10 +147,9 @@ def test_heave_and_the_speed_of_the_water_down_to_the_bottom_are_common(drawn):
     """Heave in place of the depth of the array; the water's speed to the bottom where the sediment
     has a speed of its own; else it is water."""
     depth, _, _, estimates = followed(drawn, heave='independent')
-    heave, stated, common = (
-        np.array([each.extras[name] for each in estimates])
-        for name in ('heave', 'heave_std', 'depth_common_std')
-    )
+    names = 'heave', 'heave_std', 'depth_common_std'
+    rows = (np.array([each.extras[name] for each in estimates]) for name in names)
+    heave, stated, common = rows
     height = depth + heave - ARRAY
     assert common**2 == pytest.approx(stated**2 + (height / 300.0) ** 2, rel=1e-9)
     depth, *_, water = followed(drawn)
@@ -165,13 +162,6 @@ def test_heave_and_the_speed_of_the_water_down_to_the_bottom_are_common(drawn):
     bottom = np.broadcast_to(height[:, :1], height.shape)
     due = (height**2 - bottom**2) / 300.0**2
     assert water - own == pytest.approx(due, rel=1e-6, abs=1e-9)
-
-
-FEW = {'particles': 2000, 'frequency_min': 100.0, 'frequency_max': 2800.0, 'sound_speed_std': 0.0}
-
-
-LAYERS = np.array([52.0, 56.5, 60.0, 64.2, 68.0, 72.5])
-STRENGTH = np.array([25.0, 18.0, 13.0, 10.0, 8.5, 7.0])
 
 
 def found_of(changes):
@@ -318,10 +308,6 @@ def test_what_all_are_off_by_together():
     ):  # fmt: skip
         assert known.offset(np.array(depths), reach, 0.4) == pytest.approx(due, abs=0.1)
     assert Identities().offset(np.array(seen), 1.5, 0.4) == 0.0
-
-
-FEWER = {**FEW, 'particles': 1500}
-RECORDS, AT = 24, 14
 
 
 def tracked(floor, **options):

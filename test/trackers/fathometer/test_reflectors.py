@@ -123,9 +123,8 @@ def test_what_was_lost_does_not_take_over_from_what_is_still_seen():
     lost, seen = (Identified(6, 22.78, 4), Identified(7, 22.92, 0))
     assert list(verbs.nearest_ids(np.array([22.83]), [lost, seen], config)) == [7]
     # Far more probable where it was than a walk of four standard deviations.
-    assert list(verbs.nearest_ids(np.array([22.53]), [Identified(6, 22.54, 4), seen], config)) == [
-        6
-    ]
+    nearer = Identified(6, 22.54, 4)
+    assert list(verbs.nearest_ids(np.array([22.53]), [nearer, seen], config)) == [6]
     # Of two that were seen equally long ago the nearest, whatever the order.
     for earlier in ([seen, Identified(8, 22.8, 0)], [Identified(8, 22.8, 0), seen]):
         assert list(verbs.nearest_ids(np.array([22.84, 23.0]), earlier, config)) == [8, 7]
@@ -183,7 +182,6 @@ def test_identities_beyond_32_bits_are_those_that_no_reflector_has():
 
 
 def test_pmf_of_what_is_detectable_is_that_of_independent_reflectors():
-    """Poisson-binomial, by enumeration of who is there."""
     config = FathometerConfig(order_max=4, detectable_sigmas=4.0)
     rows = zip((1, 2, 3), (10.0, 12.0, 14.0), (9.0, -4.1, 2.0), (20, 5, 1))
     known = Identities(tuple(Identified(k, z, 0, strength=s, shown=n) for k, z, s, n in rows))
@@ -221,9 +219,6 @@ def test_weak_layers_are_not_counted_among_the_detectable():
     assert sum(late[-1][f'prob_detectable_{k}'][0] for k in range(13)) == pytest.approx(1.0)
 
 
-PRIMARIES = np.array([9.0, 12.5, 17.0, 23.0])
-
-
 def record(depth, sign=None, std=0.03, ids=None):
     depth = np.asarray(depth, float)
     K = len(depth)
@@ -242,7 +237,8 @@ def after(depths, config, **options):
 
 def drawn(rng, records, walk):
     """Depths (T, 6), ascending, with errors: the primaries, a surface multiple, a peg-leg."""
-    z = PRIMARIES + walk * np.cumsum(rng.standard_normal((records, 4)), axis=0)
+    primaries = np.array([9.0, 12.5, 17.0, 23.0])
+    z = primaries + walk * np.cumsum(rng.standard_normal((records, 4)), axis=0)
     surface, leg = z[:, 0] + z[:, 2], 2.0 * z[:, 3] - z[:, 0]
     found = np.column_stack([z, surface, leg]) + 0.03 * rng.standard_normal((records, 6))
     found[:, 4] += 0.03 * rng.standard_normal(records)

@@ -30,6 +30,11 @@ from sonar_imm_tools.simulation.fathometer import simulator
 from sonar_imm_tools.simulation.fathometer.scenario import Drift
 
 MIRROR = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
+LAYER, ARRAY = 130.0, 73.5
+SHORT = {
+    'phones': 6, 'frequency_max': 900.0, 'record_seconds': 4.0, 'depth_min': 85.0,
+    'depth_max': 100.0, 'particles': 100,
+}  # fmt: skip
 
 
 def test_the_mirror_lies_at_negative_lags():
@@ -99,18 +104,16 @@ def test_the_mirror_window_ends_at_half_a_snapshot(half, expected):
 
 def test_noise_depths_that_a_snapshot_cannot_hold_are_mirrored_and_said():
     """With 0.2 s the lags of 180 m to 300 m are those of the array itself, and its depths."""
-    scene = simulator.simulate(
-        simulator.scenario('small', {'records': 1, 'depth_companion': False}), 5
-    )
+    small = simulator.scenario('small', {'records': 1, 'depth_companion': False})
+    scene = simulator.simulate(small, 5)
     spectra = scene.measurements[0].measurement
     base = {**simulator.scenario('small').instruments(), 'particles': 200}
     lattice = responses.Lattice(125.0, 0.05, 500)
     depth = spectra.reference_depth
 
     def response(**options):
-        return responses.array_response(
-            spectra, lattice, FathometerConfig(**base, **options), depth
-        )
+        config = FathometerConfig(**base, **options)
+        return responses.array_response(spectra, lattice, config, depth)
 
     wrapped, mirror = response(), response(**MIRROR)
     assert wrapped.noise_wraps and not mirror.noise_wraps
@@ -121,9 +124,6 @@ def test_noise_depths_that_a_snapshot_cannot_hold_are_mirrored_and_said():
     told = run([spectra], **base, noise_depth_max=310.0)[0].warnings()
     (said,) = (each for each in told if 'half a snapshot' in each)
     assert '75 m below the array with 0.2 s' in said
-
-
-LAYER, ARRAY = 130.0, 73.5
 
 
 @pytest.fixture(scope='module')
@@ -152,10 +152,8 @@ def test_echoes_are_positive_and_where_they_should_be(spectra):
         assert depth[np.argmax(e)] == pytest.approx(LAYER, abs=0.2)
     # The conventional one is printed right.
     options = {'envelope': True, 'processor': 'conventional'}
-    e, c = (
-        received(spectra, 110.0, 140.0, output=output, **options)[1]
-        for output in ('printed', 'correlation')
-    )
+    known, names = (spectra, 110.0, 140.0), ('printed', 'correlation')
+    e, c = (received(*known, output=name, **options)[1] for name in names)
     assert e == pytest.approx(c, rel=1e-5)
 
 
@@ -179,12 +177,6 @@ def test_the_pulse_of_an_envelope():
     assert (pulse(np.linspace(-3.0, 3.0, 999)) >= 0.0).all()
     with pytest.raises(ValueError):
         envelope_pulse(10.0, 5.0, 1500.0)
-
-
-SHORT = {
-    'phones': 6, 'frequency_max': 900.0, 'record_seconds': 4.0, 'depth_min': 85.0,
-    'depth_max': 100.0, 'particles': 100,
-}  # fmt: skip
 
 
 def noise(seconds, *, rate=2000.0, phones=6, depths=None, block=0.5, seed=0):
@@ -289,16 +281,13 @@ def test_an_array_that_heaves_within_a_record_is_said_and_its_mean_is_taken():
     assert run(told, **SHORT)[0].counts['heave_within_record'] == 1
 
 
-@pytest.mark.parametrize(
-    'rate, phones, options',
-    [
-        (1e7, 250, {'snapshot_seconds': 4.0}),  # 10^10 samples would wait for the first snapshot
-        (12e3, 250, {'snapshot_seconds': 3.0}),  # the cross-spectra
-        (12e3, 100, {'snapshot_seconds': 0.2, 'preview_seconds': 1.0, 'record_seconds': 86400.0}),
-        (1e6, 3, {'snapshot_seconds': 1.0, 'frequency_max': 4e5}),  # frequencies
-        (1.0, 6, {}),  # no frequency at all
-    ],
-)
+@pytest.mark.parametrize('rate, phones, options', [
+    (1e7, 250, {'snapshot_seconds': 4.0}),  # 10^10 samples would wait for the first snapshot
+    (12e3, 250, {'snapshot_seconds': 3.0}),  # the cross-spectra
+    (12e3, 100, {'snapshot_seconds': 0.2, 'preview_seconds': 1.0, 'record_seconds': 86400.0}),
+    (1e6, 3, {'snapshot_seconds': 1.0, 'frequency_max': 4e5}),  # frequencies
+    (1.0, 6, {}),  # no frequency at all
+])  # fmt: skip
 def test_arrays_that_would_take_too_much_are_refused_and_others_go_on(rate, phones, options):
     pressure = np.random.default_rng(0).standard_normal((100, phones))
     hostile = Pressure(stamp_ns=10**17, pressure=pressure, sample_rate=rate)
@@ -324,7 +313,6 @@ def test_an_array_that_is_refused_between_good_blocks_costs_nothing():
 
 
 def test_a_long_block_is_taken_in_pieces_with_the_same_result(monkeypatch):
-
     config = FathometerConfig(**SHORT)
     (block,) = noise(8.0, block=8.0)
     (whole, *_), _ = PressureStream(config, Counter()).push(block, 20.0)
@@ -344,11 +332,8 @@ def vectors():
 def collected(vectors, record):
     names = 'element_spacing snapshot_seconds record_seconds frequency_min frequency_max'
     config = FathometerConfig(phones=16, **{name: float(vectors[name]) for name in names.split()})
-    block = Pressure(
-        stamp_ns=1,
-        pressure=vectors['p'][record] * vectors['scale'][record],
-        sample_rate=float(vectors['sample_rate']),
-    )
+    known = {'pressure': vectors['p'][record] * vectors['scale'][record]}
+    block = Pressure(stamp_ns=1, sample_rate=float(vectors['sample_rate']), **known)
     (found,), _ = PressureStream(config, Counter()).push(block, 40.0)
     return config, found
 
@@ -362,9 +347,8 @@ def test_what_is_made_of_pressure_is_what_the_vectors_have(vectors):
     """Cross-spectra, coherence, spectrum and pulse of the processor, response, mirror noise."""
     record, v, (config, found) = 0, vectors, collected(vectors, 0)
     config, spectra = evolve(config, phone_correction='off', **MIRROR), found.spectra
-    lattice = responses.Lattice(
-        float(v['depth'][0]), float(v['depth'][1] - v['depth'][0]), len(v['depth'])
-    )
+    first, second = (float(z) for z in v['depth'][:2])
+    lattice = responses.Lattice(first, second - first, len(v['depth']))
     coherent = responses.array_coherence(spectra, config)
     response = responses.array_response(spectra, lattice, config, float(v['array_depth'][record]))
     near = responses.Lattice(40.0, lattice.step, 320)

@@ -27,6 +27,11 @@ from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 RECORD_NS = 90 * 10**9
 SEVEN = {'order_min': 7, 'order_max': 8}
+DEPTH = 50.0 + 1e-4 * np.arange(50_000)
+FINE = Trace(stamp_ns=1, depth=DEPTH, amplitude=np.sin(DEPTH))
+"""50,000 steps of a tenth of a millimetre: 400 kB."""
+LAYERS, STRENGTH = np.array([14.0, 19.5, 27.0]), np.array([1.0, 0.5, 0.3])
+BAND = band_pulse(50.0, 4000.0, 1500.0)
 
 
 @pytest.fixture(scope='module')
@@ -127,9 +132,8 @@ def test_the_uncertainty_of_amplitudes_is_that_of_their_errors(memory, expected)
 
 def test_noise_alone_has_no_reflector():
     rng, depth = np.random.default_rng(0), np.arange(100.0, 150.0, 0.1)
-    noise = [
-        Trace(stamp_ns=k, depth=depth, amplitude=rng.standard_normal(500)) for k in range(1, 30)
-    ]
+    samples = rng.standard_normal((29, 500))
+    noise = [Trace(stamp_ns=k, depth=depth, amplitude=row) for k, row in enumerate(samples, 1)]
     _, found = run(noise, pulse='gaussian', pulse_width=0.05, order_min=0, particles=2000)
     nothing = [each for each in found.values() if np.isnan(each.state[0, 0])]
     assert len(nothing) > 24
@@ -181,7 +185,6 @@ def test_the_same_input_gives_the_same_bytes(vectors):
 
 
 def test_strange_input_is_counted(vectors):
-    """A trace without noise, one that lies elsewhere later."""
     flat = Trace(stamp_ns=2, depth=np.arange(100.0), amplitude=np.ones(100))
     tracker, found = run([flat], particles=100)
     assert not found and tracker.counts['no_noise'] == 1
@@ -190,24 +193,20 @@ def test_strange_input_is_counted(vectors):
     assert run(given, particles=300)[0].counts['other_depths'] == 1
 
 
-@pytest.mark.parametrize(
-    'parameters, word',
-    [
-        ({'order_min': 9, 'order_max': 7}, 'order_max'),
-        ({**SEVEN, 'order_transition_matrix': [1.0]}, '2 x 2'),
-        ({**SEVEN, 'order_transition_matrix': [0.5, 0.5, 0.5, 0.6]}, 'row 1'),
-        ({'pulse': 'file'}, 'pulse_file'),
-        ({'frequency_min': 5000.0}, 'frequency_max'),
-        ({'depth_min': 50.0}, 'depth_max'),
-        ({'particles': 0}, 'particles'),
-        ({'particles': 10_000_000, 'order_max': 12}, 'memory'),
-        ({'heave': 'memory', 'array_depth_std': 0.0}, 'array_depth_std'),
-        ({'output': 'printed', 'processor': 'white_noise'}, 'printed'),
-        ({'noise_depth_min': 10.0, 'noise_depth_max': 0.0}, 'noise_depth_max'),
-        ({'negative_probability': 1.0}, 'negative_probability'),
-        ({'snapshot_seconds': 1e-4}, '0.001'),
-    ],
-)
+@pytest.mark.parametrize('parameters, word', [
+    ({'order_min': 9, 'order_max': 7}, 'order_max'),
+    ({**SEVEN, 'order_transition_matrix': [1.0]}, '2 x 2'),
+    ({**SEVEN, 'order_transition_matrix': [0.5, 0.5, 0.5, 0.6]}, 'row 1'),
+    ({'pulse': 'file'}, 'pulse_file'),
+    ({'frequency_min': 5000.0}, 'frequency_max'), ({'depth_min': 50.0}, 'depth_max'),
+    ({'particles': 0}, 'particles'),
+    ({'particles': 10_000_000, 'order_max': 12}, 'memory'),
+    ({'heave': 'memory', 'array_depth_std': 0.0}, 'array_depth_std'),
+    ({'output': 'printed', 'processor': 'white_noise'}, 'printed'),
+    ({'noise_depth_min': 10.0, 'noise_depth_max': 0.0}, 'noise_depth_max'),
+    ({'negative_probability': 1.0}, 'negative_probability'),
+    ({'snapshot_seconds': 1e-4}, '0.001'),
+])  # fmt: skip
 def test_configurations_that_cannot_be(parameters, word):
     with pytest.raises(ConfigError, match=word):
         FathometerConfig(**parameters)
@@ -228,21 +227,11 @@ def test_a_pulse_from_a_file(tmp_path):
         assert len(str(raised.value)) < 300
 
 
-DEPTH = 50.0 + 1e-4 * np.arange(50_000)
-FINE = Trace(stamp_ns=1, depth=DEPTH, amplitude=np.sin(DEPTH))
-"""50,000 steps of a tenth of a millimetre: 400 kB."""
-
-
-@pytest.mark.parametrize(
-    'parameters',
-    [
-        {},
-        {'depth_std': 100.0, 'depth_step': 1e-3},
-        {'depth_step': 1e-9, 'depth_min': 50.0, 'depth_max': 50.0 + 1e-6},
-        {'depth_step': 1e-300},
-        {'heave': 'independent', 'array_depth_std': 1000.0, 'depth_std': 1e-3},
-    ],
-)
+@pytest.mark.parametrize('parameters', [
+    {}, {'depth_std': 100.0, 'depth_step': 1e-3},
+    {'depth_step': 1e-9, 'depth_min': 50.0, 'depth_max': 50.0 + 1e-6}, {'depth_step': 1e-300},
+    {'heave': 'independent', 'array_depth_std': 1000.0, 'depth_std': 1e-3},
+])  # fmt: skip
 def test_lattices_that_would_fill_the_memory_are_refused(parameters):
     """Tables of moves hold every cell times every distance a reflector can move by."""
     config = FathometerConfig(particles=100, **parameters)
@@ -263,9 +252,6 @@ def test_conventional_amplitudes_are_a_third_unless_they_are_remembered():
     conventional = FathometerConfig(processor='conventional')
     assert conventional.amplitude_std == 2.5
     assert evolve(conventional, amplitude_memory=0.9).amplitude_std == 7.5
-
-
-LAYERS, STRENGTH = np.array([14.0, 19.5, 27.0]), np.array([1.0, 0.5, 0.3])
 
 
 def made(width, records=12, noise=0.05, seed=5):
@@ -305,9 +291,6 @@ def test_pulse_of_the_band_is_left_alone(vectors):
     # What is told is used, and echoes narrower than the samples say nothing.
     assert not EchoWidth().take(next(made(0.5)), FathometerConfig(pulse='band'), BAND)
     assert not EchoWidth().take(next(made(0.03)), config, BAND)
-
-
-BAND = band_pulse(50.0, 4000.0, 1500.0)
 
 
 def test_pulse_is_judged_anew_until_many_traces_have_shown_it():

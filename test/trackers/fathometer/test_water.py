@@ -25,12 +25,10 @@ from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 SECOND, STEP, SAMPLES, PULSE, SETTLED = 10**9, 0.05, 400, 0.15, 10
 LINES = {
-    'flat': {},
-    'silent water': {'noise': 0.002, 'threshold': 0.02},
-    'scatter': {'scatter': 0.3},
-    'transmit pulse': {'ring': 1.5},
-    'waves': {'waves': 2.5},
-}
+    'flat': {}, 'silent water': {'noise': 0.002, 'threshold': 0.02}, 'scatter': {'scatter': 0.3},
+    'transmit pulse': {'ring': 1.5}, 'waves': {'waves': 2.5},
+}  # fmt: skip
+CUT = {'pulse': 'gaussian', 'noise_sigma': 0.05, 'min_separation': 1.5, 'depth_std': 0.1}
 
 
 def line(
@@ -77,11 +75,9 @@ def test_an_echo_at_a_fixed_depth_and_a_line_that_begins_below_its_floor_are_sai
     assert any('no water is seen' in each or 'none of' in each for each in warnings)
 
 
-FEW = {'particles': 300, 'min_separation': 0.45, 'depth_std': 0.35, 'order_max': 6}
-
-
 def run(traces, **options):
-    tracker = FathometerTracker(FathometerConfig(**{**FEW, 'sound_speed_std': 0.0, **options}))
+    few = {'particles': 300, 'min_separation': 0.45, 'depth_std': 0.35, 'order_max': 6}
+    tracker = FathometerTracker(FathometerConfig(**{**few, 'sound_speed_std': 0.0, **options}))
     return tracker, [each.columns() for trace in traces for each in tracker.process(trace)]
 
 
@@ -257,9 +253,6 @@ def cut_line(first, top=12.0):
         echo += np.exp(-0.5 * np.square((depth[:, None] - [top, lower]) / 0.5)).sum(axis=1)
         seen = depth >= first
         yield Trace(stamp_ns=(k + 1) * 10**9, depth=depth[seen], amplitude=echo[seen])
-
-
-CUT = {'pulse': 'gaussian', 'noise_sigma': 0.05, 'min_separation': 1.5, 'depth_std': 0.1}
 
 
 def test_below_a_floor_that_the_window_cuts_nothing_is_the_floor():
