@@ -10,7 +10,7 @@
 sensor sees, and who leaves it."""
 
 from attrs import evolve
-from helpers.diver_runs import arrivals, fix, followed, run, scan, SECOND
+from helpers.diver_runs import arrivals, fix, followed, miss, run, scan, SECOND
 import numpy as np
 import pymap3d
 import pytest
@@ -344,6 +344,27 @@ def test_what_does_not_turn_with_the_vessel(what):
     seen = relative(1.5, (30.0, 0.0, 0.0), levelled=levelled)
     (estimate,) = run(DiverTracker(DiverConfig(**config)), [*near, seen])
     assert estimate.state[0, :2] == pytest.approx(place, abs=0.05)
+
+
+@pytest.mark.statistics
+def test_the_tracker_is_consistent_with_all_errors_drawn():
+    """A diver that rests is seen by a transceiver on a vessel that circles it: NEES."""
+    rng, nees = np.random.default_rng(5), []
+    stds = {'vessel_position_std': 0.5, 'vessel_heading_std_deg': 1.0, 'relative_range_std': 0.5}
+    for _ in range(12):
+        tracker, made = DiverTracker(DiverConfig(**stds)), []
+        for k in range(1, 41):
+            angle = 0.05 * k
+            where = np.array([60.0 * np.cos(angle), 60.0 * np.sin(angle), 0.0])
+            yaw = angle + np.pi / 2
+            seen = rotation(0, 0, yaw).T @ (-where)
+            turn = rotation(0.0, *np.radians(2.0) * rng.normal(size=2))
+            offset = turn @ seen * (1.0 + 0.5 * rng.normal() / np.linalg.norm(seen))
+            at = where + 0.5 * rng.normal(size=3) * [1, 1, 0]
+            noisy = pose(k, *at[:2], yaw + np.radians(rng.normal()), frame_id='map')
+            made += run(tracker, [noisy, relative(k, offset, frame_id='usbl')])
+        nees.append(miss(made[-1], np.zeros(2))[1])
+    assert 0.5 < np.mean(nees) < 4.0  # 2 is due, for 24 numbers
 
 
 def written(tmp_path, name, header, rows):
