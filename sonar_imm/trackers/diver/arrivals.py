@@ -368,7 +368,6 @@ def _explain_tag(
 
     With `max_tracks: 1` the existing track takes every ping. Otherwise the best explanation inside
     the gate does if more than half of the arrivals fit, a confirmed track before a tentative one.
-    The ping of one tag is no miss of the others.
     """
     score = known['score'] + np.log1p(-config.detection_probability)
     tentative = known.life.status == TENTATIVE
@@ -380,7 +379,6 @@ def _explain_tag(
         update = make_track_update(mixtures[track], after, ping, config)
         taken = np.full(len(ping.row), 2 * update.good.sum() > len(update.good))
         if taken.all() or config.max_tracks == 1:
-            score = known['score'].copy()
             score[track] += float(update.good.sum())
             return Explanation({track: update}, taken, score)
     return Explanation({}, np.zeros(len(ping.row), bool), score)

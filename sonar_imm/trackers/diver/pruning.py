@@ -83,8 +83,11 @@ def pruning_stage(
         alive = known.is_finite()
         known = known.add_counts(broken=int((~alive).sum()))
         hit, looked = known['nis_dof'] > 0, scan.complete & (known['target_id'] == NOBODY)
-        if scan.are_tags and hit.any():
-            looked = looked & hit  # the ping of one tag is no miss of the others
+        if scan.are_tags:
+            # Tags ping in turn: one that was heard since the last ping of this one is not missed,
+            # and the ping of a new one is no miss of any.
+            heard = known.life.last_hit_ns
+            looked = looked & (hit | (heard < (heard[hit].min() if hit.any() else 0)))
         # A rejected fix counts as a miss, so a track does not coast while fixes arrive near it.
         rejected = known['rejected'][:, 0] == known.stamp_ns
         if covered:
