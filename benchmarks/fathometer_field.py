@@ -38,14 +38,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-import os
 from pathlib import Path
 import tempfile
 from typing import Any
 
 import numpy as np
 
-from benchmarks.study import Parts, standard_error, study
+from benchmarks.study import DATA, Parts, standard_error, study
 from sonar_imm.acoustics.ambient import sample_csdm, surface_noise_csdm
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimates import Estimate
@@ -62,8 +61,7 @@ SPACING = 0.376
 
 
 def real_lines() -> list[Path]:
-    folder = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data')) / 'sbp_chiapas'
-    return sorted(folder.glob('*.seg'))
+    return sorted((DATA / 'sbp_chiapas').glob('*.seg'))
 
 
 # -- profiler lines -------------------------------------------------------------------------------

@@ -36,11 +36,10 @@ import sys
 import time
 from typing import Any
 
-from benchmarks.study import known, write_json
+from benchmarks.study import known, ROOT, write_json
 from sonar_imm import __version__
 from sonar_imm.trackers import SYSTEMS
 
-ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / 'docs' / 'results' / 'reliability.json'
 CASES = os.environ.get('CASES', '100000')
 """Hostile messages for each system."""

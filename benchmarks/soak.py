@@ -32,13 +32,12 @@ from typing import Any
 import numpy as np
 from scipy.stats import theilslopes
 
-from benchmarks.study import in_fresh_process, known, Parts, study
+from benchmarks.study import in_fresh_process, known, Parts, ROOT, study
 from msg_adapters.inputs import inputs_of
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.recordings.measurements import fitting_topics
 from sonar_imm_tools.recordings.reader import BagReader
 
-ROOT = Path(__file__).parents[1]
 SECOND = 10**9
 SAMPLES = 200
 """Readings of the resident memory."""

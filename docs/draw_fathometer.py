@@ -14,7 +14,6 @@ Needs matplotlib, which nothing else here does, and for the real lines segyio an
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 import sys
 import tempfile
@@ -30,6 +29,7 @@ sys.path.insert(0, str(ROOT))
 from matplotlib import pyplot as plt  # noqa: E402
 
 from benchmarks.fathometer_paper import BOOTSTRAP, ChangedTracker  # noqa: E402
+from benchmarks.study import DATA  # noqa: E402
 from sonar_imm.acoustics import fathometer  # noqa: E402
 from sonar_imm.measurements import Trace  # noqa: E402
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker  # noqa: E402
@@ -45,7 +45,7 @@ from sonar_imm_tools.simulation.fathometer.scenario import (  # noqa: E402
 from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, simulate  # noqa: E402
 
 IMAGES = ROOT / 'docs' / 'images'
-DATA = Path(os.environ.get('SONAR_IMM_DATA', ROOT.parent / 'shared' / 'data')) / 'sbp_chiapas'
+RECORDED = DATA / 'sbp_chiapas'
 LINES = (
     'MET_EW-WE_SBP_L1_WE_20180313165838.seg',
     'MET_EW-WE_SBP_L2_EW_20180313171011.seg',
@@ -66,7 +66,7 @@ def main() -> None:
     draw_orders(processed)
     draw_fixed_orders(processed['mvdr'])
     draw_ship(drift(3, range(150, 206), PASS))
-    if DATA.exists():
+    if RECORDED.exists():
         draw_lines()
 
 
@@ -351,7 +351,7 @@ def draw_lines() -> None:
     for name, axis in zip(LINES, axes):
         with tempfile.TemporaryDirectory() as folder:
             convert_segy(
-                DATA / name,
+                RECORDED / name,
                 Path(folder) / 'bag',
                 sample_spacing=0.376,
                 first_sample=12,

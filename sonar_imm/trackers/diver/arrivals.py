@@ -44,7 +44,7 @@ from .explanations import (
     PingMeasurements,
     subset_ping,
 )
-from .heavy_tails import DEGREES, GOOD_RESIDUAL, student_t_maxima, student_t_ping
+from .heavy_tails import DEGREES, inlier_probability, student_t_maxima, student_t_ping
 from .instruments import Layout
 from .known import Known
 from .models import ModelSet, start_depths
@@ -377,10 +377,10 @@ def _explain_tag(
             continue
         track, after = best
         update = make_track_update(mixtures[track], after, ping, config)
-        taken = np.full(len(ping.row), 2 * update.good.sum() > len(update.good))
-        if taken.all() or config.max_tracks == 1:
+        fits = 2 * update.good.sum() > len(update.good)
+        if fits or config.max_tracks == 1:
             score[track] += float(update.good.sum())
-            return Explanation({track: update}, taken, score)
+            return Explanation({track: update}, np.full(len(ping.row), fits), score)
     return Explanation({}, np.zeros(len(ping.row), bool), score)
 
 
@@ -455,7 +455,7 @@ def update_by_ping(
         if found is None:
             return None
         _, nis = fit_measurements(*found.after[:3], config.target_z, ping.measured)
-        good = 1.0 / (1.0 + nis / GOOD_RESIDUAL**2)
+        good = inlier_probability(nis)
         good[keep] = found.good
         return found._replace(good=good)
     x, P, mu, scale = before

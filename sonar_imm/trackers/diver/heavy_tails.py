@@ -77,6 +77,11 @@ FEW = 8
 """Unknowns up to which the equations of all searches are solved together."""
 
 
+def inlier_probability(squared: FloatArray) -> FloatArray:
+    """Return the inlier probability of residuals by their squares, in variances."""
+    return np.asarray(1.0 / (1.0 + squared / GOOD_RESIDUAL**2))
+
+
 class _Prior(NamedTuple):
     """The hypotheses as the searches see them: the `a` components of the state on which a ping
     depends, whitened. The others follow from them."""
@@ -366,8 +371,7 @@ def _student_t_ping(
         innovation = residual[c] + (gradient[c] * (there - means)).sum(axis=0)
         noise = wider * variance[c] / weight[c]
         consider_scalar(means, covariances, gradient[c], noise, innovation, estimated)
-    squared = (degrees + 1.0) / np.maximum(now.weight, 1e-300) - degrees
-    inlier = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
+    inlier = inlier_probability((degrees + 1.0) / np.maximum(now.weight, 1e-300) - degrees)
     each = means[:, : len(of)], covariances[..., len(of) :], inlier
     x1[known], P1[known], evidence[known], good[known] = combine(of, log, *each)
     return x1, P1, evidence, good
